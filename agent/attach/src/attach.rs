@@ -146,7 +146,7 @@ fn places(file: &File, calls: Calls) -> Result<BTreeMap<usize, Place>, AttachErr
         .enumerate()
         .filter_map(|(index, ((program, function), offset))| {
             let offset = (*offset)?;
-            let is_chosen = calls.includes(function) && !Calls::leaves_out(program, has);
+            let is_chosen = calls.includes(function) && !Calls::excludes(program, has);
             is_chosen.then_some((index, Place { function, offset }))
         });
     Ok(found.collect())

@@ -142,7 +142,7 @@ impl Broker {
 
     /// Closes the connection. The packaged broker ends some time after its last connection has
     /// closed.
-    pub fn rest(&mut self) {
+    pub fn disconnect(&mut self) {
         if matches!(self.reach, Reach::Socket(_)) {
             self.socket = None;
         }
@@ -154,7 +154,7 @@ impl Broker {
     /// Fails if the broker refuses, or cannot be reached.
     pub fn processes(&mut self) -> Result<Vec<u32>, BrokerError> {
         let mut all = Vec::new();
-        self.ask(Request::Processes, &[], |answer, _| {
+        self.request(Request::Processes, &[], |answer, _| {
             if let Answer::Processes(mut part) = answer {
                 all.append(&mut part);
             }
@@ -170,7 +170,7 @@ impl Broker {
         let mut users = Users::default();
         for part in processes.chunks(MAX_PROCESSES) {
             let processes = part.to_vec();
-            self.ask(Request::Uses { library, processes }, &[], |answer, _| {
+            self.request(Request::Uses { library, processes }, &[], |answer, _| {
                 if let Answer::Uses { used, closed } = answer {
                     for (process, part) in used {
                         users.add(process, part);
@@ -190,7 +190,7 @@ impl Broker {
         let mut all = Vec::new();
         for part in processes.chunks(MAX_PROCESSES) {
             let processes = part.to_vec();
-            self.ask(Request::Activities { processes }, &[], |answer, _| {
+            self.request(Request::Activities { processes }, &[], |answer, _| {
                 if let Answer::Activities(mut part) = answer {
                     all.append(&mut part);
                 }
@@ -206,7 +206,7 @@ impl Broker {
     /// Fails if the broker refuses, or cannot be reached.
     pub fn domain(&mut self, process: u32) -> Result<Option<u32>, BrokerError> {
         let mut found = None;
-        self.ask(Request::Domain { process }, &[], |answer, _| {
+        self.request(Request::Domain { process }, &[], |answer, _| {
             if let Answer::Domain(domain) = answer {
                 found = domain;
             }
@@ -230,7 +230,7 @@ impl Broker {
             place,
             means,
         };
-        self.ask(request, programs, |answer, descriptors| {
+        self.request(request, programs, |answer, descriptors| {
             if let Answer::Attached { functions } = answer {
                 attached = Some((descriptors, functions));
             }
@@ -244,14 +244,14 @@ impl Broker {
     /// Fails if the broker refuses, or cannot be reached.
     pub fn mappings(&mut self) -> Result<Vec<OwnedFd>, BrokerError> {
         let mut events = Vec::new();
-        self.ask(Request::Mappings, &[], |_, descriptors| {
+        self.request(Request::Mappings, &[], |_, descriptors| {
             events = descriptors;
         })?;
         Ok(events)
     }
 
     /// Sends a request, and passes each part of the answer with its descriptors to `with`.
-    fn ask(
+    fn request(
         &mut self,
         request: Request,
         descriptors: &[BorrowedFd<'_>],

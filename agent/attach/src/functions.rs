@@ -161,7 +161,7 @@ impl Calls {
 
     /// Returns whether a program is left out, because a program at another function of the library
     /// reports the same.
-    pub(crate) fn leaves_out(program: &str, has: impl Fn(&str) -> bool) -> bool {
+    pub(crate) fn excludes(program: &str, has: impl Fn(&str) -> bool) -> bool {
         program == RECEPTION_PROGRAM.0 && has(ENQUEUE)
     }
 }

@@ -77,7 +77,7 @@ pub enum Request {
 impl Request {
     /// Returns the time in which the request is answered.
     #[must_use]
-    pub const fn patience(&self) -> Duration {
+    pub const fn timeout(&self) -> Duration {
         match self {
             Self::Domain { .. } => ENVIRONMENT_TIMEOUT,
             _ => REQUEST_TIMEOUT,

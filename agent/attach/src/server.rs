@@ -187,8 +187,8 @@ fn ready(source: Option<BorrowedFd<'_>>, limit: Duration) -> io::Result<bool> {
 struct Tokens {
     left: f64,
     rate: f64,
-    most: f64,
-    filled: Instant,
+    capacity: f64,
+    last_refill: Instant,
 }
 
 impl Tokens {
@@ -196,16 +196,16 @@ impl Tokens {
         Self {
             left: most,
             rate,
-            most,
-            filled: Instant::now(),
+            capacity: most,
+            last_refill: Instant::now(),
         }
     }
 
     /// Takes a token, or waits for the next one.
     fn take(&mut self) {
         let now = Instant::now();
-        let new = (now - self.filled).as_secs_f64() * self.rate;
-        (self.left, self.filled) = ((self.left + new).min(self.most), now);
+        let new = (now - self.last_refill).as_secs_f64() * self.rate;
+        (self.left, self.last_refill) = ((self.left + new).min(self.capacity), now);
         self.left -= 1.0;
         if self.left < 0.0 {
             std::thread::sleep(Duration::from_secs_f64(-self.left / self.rate));
@@ -281,7 +281,7 @@ impl Connection {
 
     /// Waits for the answer of a child process, which is killed at its deadline.
     fn finish(&mut self, child: Pid, request: Numbered<Request>) -> io::Result<()> {
-        let (number, patience) = (request.number, request.content.patience());
+        let (number, patience) = (request.number, request.content.timeout());
         let end = pidfd_open(child, PidfdFlags::empty());
         let has_ended = end.is_ok_and(|end| ready(Some(end.as_fd()), patience).unwrap_or(false));
         if has_ended {

@@ -37,13 +37,13 @@ impl Progress {
     }
 
     /// Cancels the compression at its next read; the file stays as it is.
-    pub fn give_up(&self) {
+    pub fn cancel(&self) {
         self.given_up.store(true, Ordering::Relaxed);
     }
 
-    /// Returns whether [`Self::give_up`] was called.
+    /// Returns whether [`Self::cancel`] was called.
     #[must_use]
-    pub fn is_given_up(&self) -> bool {
+    pub fn is_cancelled(&self) -> bool {
         self.given_up.load(Ordering::Relaxed)
     }
 }
@@ -164,7 +164,7 @@ impl<R: Read> Read for ProgressReader<'_, R> {
         if self.failed.is_some() {
             return Ok(0);
         }
-        if self.progress.is_given_up() {
+        if self.progress.is_cancelled() {
             self.failed = Some(io::Error::other("abandoned"));
             return Ok(0);
         }
@@ -303,7 +303,7 @@ mod tests {
                 .unwrap();
             assert_eq!(progress.read(), 1_000_000);
         }
-        progress.give_up();
+        progress.cancel();
         for compression in [Compression::None, Compression::Lz4, Compression::Zstd] {
             let source = File::open(&path).unwrap();
             let error = compression.compress_file(&source, &into, &progress);

@@ -413,13 +413,13 @@ impl FileWriter {
     fn append(&mut self, pieces: &[&[u8]]) -> io::Result<()> {
         let length: u64 = pieces.iter().map(|piece| piece.len() as u64).sum();
         if self.is_torn {
-            self.cut()?;
+            self.truncate()?;
         }
         for piece in pieces {
             if let Err(error) = self.file.write_all(piece) {
                 // A failing disk may also refuse the truncation. The next write then repeats it.
                 self.is_torn = true;
-                let _ = self.cut();
+                let _ = self.truncate();
                 return Err(error);
             }
         }
@@ -431,7 +431,7 @@ impl FileWriter {
     }
 
     /// Truncates the file to the last complete record.
-    fn cut(&mut self) -> io::Result<()> {
+    fn truncate(&mut self) -> io::Result<()> {
         self.file.set_len(self.position)?;
         self.file.seek(io::SeekFrom::Start(self.position))?;
         self.is_torn = false;

@@ -232,7 +232,7 @@ fn write_part(path: &Path, part: &Path, scan: &Scan) -> io::Result<Found> {
     let cut = cut_bytes(&mut source, scan)?;
     writer.finish(std::iter::empty())?;
     writer.sync()?;
-    let kept = keep_aside(path, &mut source, scan)?;
+    let kept = save_remainder(path, &mut source, scan)?;
     fs::rename(part, path)?;
     Ok(Found::Unfinished {
         salvaged,
@@ -258,7 +258,7 @@ fn cut_bytes(source: &mut File, scan: &Scan) -> io::Result<u64> {
 }
 
 /// Copies the bytes after the last complete record into a file beside it, for manual recovery.
-fn keep_aside(path: &Path, source: &mut File, scan: &Scan) -> io::Result<Option<String>> {
+fn save_remainder(path: &Path, source: &mut File, scan: &Scan) -> io::Result<Option<String>> {
     if cut_bytes(source, scan)? == 0 {
         return Ok(None);
     }

@@ -18,7 +18,7 @@ const LIFETIME_NANOSECONDS: i64 = 30_000_000_000;
 
 /// A complete item for the model.
 #[derive(Debug)]
-pub enum Ready {
+pub enum ReadyItem {
     /// A record of a complete datagram.
     Record(Record),
     /// The rest of a complete datagram that the kernel filter handed over.
@@ -49,16 +49,16 @@ struct Waiting {
 impl Ahead {
     /// Accepts a record of source `namespace`. The caller passes handovers to the reassembly; here
     /// a handover only announces that the rest of the datagram follows.
-    pub fn record(&mut self, namespace: u32, record: Record, ready: impl FnMut(Ready)) {
+    pub fn record(&mut self, namespace: u32, record: Record, ready: impl FnMut(ReadyItem)) {
         let mut ready = ready;
         if record.datagram == 0 {
-            return ready(Ready::Record(record));
+            return ready(ReadyItem::Record(record));
         }
         let token = (namespace, record.datagram);
         if record.flags & flag::AHEAD == 0 && !self.waiting.contains_key(&token) {
             // The usual case: a single record of a complete datagram.
             if !matches!(record.body(), Body::Complete) {
-                ready(Ready::Record(record));
+                ready(ReadyItem::Record(record));
             }
             return;
         }
@@ -74,11 +74,11 @@ impl Ahead {
                 waiting.complete = Some(record.time);
             }
         });
-        self.settle(token, ready);
+        self.complete_datagram(token, ready);
     }
 
     /// Accepts the rest of a handed-over datagram.
-    pub fn rest(&mut self, namespace: u32, rest: Reassembled, ready: impl FnMut(Ready)) {
+    pub fn rest(&mut self, namespace: u32, rest: Reassembled, ready: impl FnMut(ReadyItem)) {
         let Some(handover) = rest.handover else {
             return;
         };
@@ -87,7 +87,7 @@ impl Ahead {
             waiting.handed_over = true;
             waiting.rest = Some(rest);
         });
-        self.settle(token, ready);
+        self.complete_datagram(token, ready);
     }
 
     /// Discards datagrams that can no longer become complete.
@@ -95,7 +95,7 @@ impl Ahead {
         let is_late =
             |(born, _): &mut (Timestamp, _)| now.nanoseconds_since(*born) > LIFETIME_NANOSECONDS;
         while let Some(oldest) = self.oldest.pop_front_if(is_late) {
-            self.give_up(Some(oldest));
+            self.discard(Some(oldest));
         }
     }
 
@@ -109,7 +109,7 @@ impl Ahead {
     fn change(&mut self, token: Token, at: Timestamp, change: impl FnOnce(&mut Waiting)) {
         if !self.waiting.contains_key(&token) {
             let oldest = self.oldest.push_back((at, token));
-            self.give_up(oldest);
+            self.discard(oldest);
         }
         let waiting = self.waiting.entry(token).or_default();
         let before = waiting.bytes();
@@ -118,11 +118,11 @@ impl Ahead {
         self.bytes.add(waiting.bytes());
         while self.bytes.is_exceeded() && !self.oldest.is_empty() {
             let oldest = self.oldest.pop_front();
-            self.give_up(oldest);
+            self.discard(oldest);
         }
     }
 
-    fn give_up(&mut self, oldest: Option<(Timestamp, Token)>) {
+    fn discard(&mut self, oldest: Option<(Timestamp, Token)>) {
         if let Some((_, oldest)) = oldest {
             self.given_up += u64::from(self.remove(oldest).is_some());
         }
@@ -134,7 +134,7 @@ impl Ahead {
         Some(waiting)
     }
 
-    fn settle(&mut self, token: Token, mut ready: impl FnMut(Ready)) {
+    fn complete_datagram(&mut self, token: Token, mut ready: impl FnMut(ReadyItem)) {
         let Some(waiting) = self.waiting.get(&token) else {
             return;
         };
@@ -146,14 +146,14 @@ impl Ahead {
             return;
         };
         for record in waiting.records {
-            ready(Ready::Record(Record {
+            ready(ReadyItem::Record(Record {
                 time,
                 flags: record.flags & !flag::AHEAD,
                 ..record
             }));
         }
         if let Some(rest) = waiting.rest {
-            ready(Ready::Rest(rest));
+            ready(ReadyItem::Rest(rest));
         }
     }
 }
@@ -168,7 +168,7 @@ impl Waiting {
             rest,
             complete: _,
         } = self;
-        let rest = rest.as_ref().map_or(0, Reassembled::held);
+        let rest = rest.as_ref().map_or(0, Reassembled::held_bytes);
         records.capacity() * size_of::<Record>() + rest
     }
 }
@@ -193,8 +193,8 @@ mod tests {
     fn taken(ahead: &mut Ahead, record: Record) -> Vec<Record> {
         let mut all = Vec::new();
         ahead.record(0, record, |ready| match ready {
-            Ready::Record(record) => all.push(record),
-            Ready::Rest(_) => unreachable!("nothing was handed over"),
+            ReadyItem::Record(record) => all.push(record),
+            ReadyItem::Rest(_) => unreachable!("nothing was handed over"),
         });
         all
     }

@@ -64,7 +64,7 @@ pub enum InterfacesError {
     Unreadable(#[from] WireError),
     /// The list changed during every attempt.
     #[error("cannot list the network interfaces: they change faster than they can be listed")]
-    Restless,
+    Unstable,
 }
 
 type Known = Bounded<KnownInterfaces, BTreeMap<u32, Interface>>;
@@ -212,7 +212,7 @@ impl Interfaces {
                 }
             }
         }
-        Err(InterfacesError::Restless)
+        Err(InterfacesError::Unstable)
     }
 
     fn ask(&mut self) -> Result<(), InterfacesError> {

@@ -115,13 +115,13 @@ pub struct LiveSource {
     bytes_refilled: u64,
     records_refilled: u64,
     /// Time when the model's requests for shared memory were last passed on.
-    wanted_asked: u64,
+    last_requests_passed: u64,
     /// Whether the last round did not pass the requests on, so that a change may wait.
-    wanted_waits: bool,
+    has_pending_requests: bool,
     /// Time when the participants' last messages were last read from the programs, for a lease.
-    heard: u64,
+    last_liveliness_read: u64,
     /// Number of attachments to a recreated control group at the last report.
-    attached_anew: u64,
+    reported_reattachments: u64,
     refused_updates: u64,
     clock: Timestamp,
     clocks: Clocks,
@@ -268,10 +268,10 @@ impl LiveSource {
             without_inside,
             bytes_refilled: 0,
             records_refilled: 0,
-            wanted_asked: 0,
-            wanted_waits: false,
-            heard: 0,
-            attached_anew: 0,
+            last_requests_passed: 0,
+            has_pending_requests: false,
+            last_liveliness_read: 0,
+            reported_reattachments: 0,
             refused_updates: 0,
             clock: clocks.now,
             clocks,
@@ -321,7 +321,7 @@ impl LiveSource {
     pub fn want_late(&self, demand: &LateDemand) {
         self.inside
             .iter()
-            .for_each(|inside| inside.want_late(demand));
+            .for_each(|inside| inside.set_late_demand(demand));
     }
 
     /// Returns why processes are not observed from inside although that is configured.
@@ -375,7 +375,7 @@ impl LiveSource {
         let taps = sockets.chain(processes).chain(interfaces).chain(looks);
         let descriptors: Vec<_> = bell.into_iter().chain(taps).collect();
         let began = Instant::now();
-        let timeout = match self.wanted_waits {
+        let timeout = match self.has_pending_requests {
             true => timeout.min(Duration::from_nanos(REFILL_INTERVAL)),
             false => timeout,
         };
@@ -435,9 +435,9 @@ impl LiveSource {
         // announcements may not have fit.
         let clock = self.clock;
         let ends = observer.next_expiry().is_some_and(|end| end <= clock);
-        let is_due = clocks.monotonic.wrapping_sub(self.heard) >= REFILL_INTERVAL;
+        let is_due = clocks.monotonic.wrapping_sub(self.last_liveliness_read) >= REFILL_INTERVAL;
         if held_up || ends && is_due {
-            self.heard = clocks.monotonic;
+            self.last_liveliness_read = clocks.monotonic;
             for (prefix, at) in self.last_seen() {
                 observer.input(Input::ParticipantAlive(prefix, at));
             }
@@ -448,8 +448,8 @@ impl LiveSource {
     /// Reports that observation begins again after a gap: this process or the machine was stopped,
     /// or the control group was removed.
     fn report_view(&mut self, held_up: bool, observer: &mut Observer) {
-        let attached_anew = self.attached_anew();
-        let is_new = std::mem::replace(&mut self.attached_anew, attached_anew) != attached_anew;
+        let attached_anew = self.reattachments();
+        let is_new = std::mem::replace(&mut self.reported_reattachments, attached_anew) != attached_anew;
         let sees_nothing = self.wires.is_empty()
             && self
                 .host
@@ -462,11 +462,11 @@ impl LiveSource {
 
     /// Passes the model's requests for shared memory to its readers, ten times a second.
     fn apply_wanted(&mut self, now: u64, observer: &Observer) {
-        self.wanted_waits = now.wrapping_sub(self.wanted_asked) < REFILL_INTERVAL;
-        if self.wanted_waits {
+        self.has_pending_requests = now.wrapping_sub(self.last_requests_passed) < REFILL_INTERVAL;
+        if self.has_pending_requests {
             return;
         }
-        self.wanted_asked = now;
+        self.last_requests_passed = now;
         self.want(observer);
     }
 
@@ -546,7 +546,7 @@ impl LiveSource {
     pub fn last_seen(&self) -> BTreeMap<GuidPrefix, Timestamp> {
         let mut seen = BTreeMap::new();
         for (participant, at) in self.filters().flat_map(Filter::participants) {
-            let at = self.clocks.calendar(at);
+            let at = self.clocks.wall_time_of(at);
             let latest = seen.entry(participant).or_insert(at);
             *latest = at.max(*latest);
         }
@@ -674,9 +674,9 @@ impl LiveSource {
     /// Returns a sentence about an observed object that no longer exists and yields no data; `None`
     /// if all exist.
     #[must_use]
-    pub fn gone(&self) -> Option<String> {
+    pub fn missing_object(&self) -> Option<String> {
         let cgroup = self.host.as_ref().and_then(HostTap::detached);
-        cgroup.or_else(|| self.wires.iter().find_map(WireTap::gone))
+        cgroup.or_else(|| self.wires.iter().find_map(WireTap::missing_object))
     }
 
     /// Returns a sentence about what is not observed yet after the start; `None` if everything is
@@ -715,14 +715,14 @@ impl LiveSource {
 
     /// Returns the number of attachments of the host hook to a recreated control group.
     #[must_use]
-    pub fn attached_anew(&self) -> u64 {
-        self.host.as_ref().map_or(0, HostTap::attached_anew)
+    pub fn reattachments(&self) -> u64 {
+        self.host.as_ref().map_or(0, HostTap::reattachments)
     }
 
     /// Switches to sampling of shared memory: the programs identify their control group by a
     /// number, and a recreated group has another one.
     fn leave_exact_mode(&mut self, clocks: &Clocks, observer: &mut Observer) {
-        if self.attached_anew() > 0
+        if self.reattachments() > 0
             && let Some(mut exact) = self.exact.take()
         {
             exact.drain(clocks, observer);

@@ -25,7 +25,7 @@ pub struct PieceAssembler {
     open: Bounded<OpenPieces, VecDeque<Open>>,
     given_up: u64,
     /// Empty buffers for reuse. In a new buffer, the kernel would have to clear each page.
-    spare: Vec<Vec<u8>>,
+    free_buffers: Vec<Vec<u8>>,
     /// Time of the latest datagram in several pieces, in the kernel's clock.
     used: u64,
 }
@@ -52,7 +52,7 @@ impl PieceAssembler {
             .position(|open| open.first.datagram == piece.datagram);
         if piece.offset == 0 {
             // The token is reused, so the remaining pieces of the other datagram are lost.
-            self.give_up(open);
+            self.discard(open);
             if !fits {
                 self.given_up += 1;
                 return None;
@@ -60,7 +60,7 @@ impl PieceAssembler {
             if piece.len == piece.datagram_len {
                 return Some((*piece, Cow::Borrowed(bytes)));
             }
-            let mut buffer = self.spare.pop().unwrap_or_default();
+            let mut buffer = self.free_buffers.pop().unwrap_or_default();
             buffer.reserve_exact(piece.datagram_len as usize);
             buffer.extend_from_slice(bytes);
             self.used = piece.time;
@@ -75,7 +75,7 @@ impl PieceAssembler {
         let index = open?;
         let open = self.open.get_mut(index)?;
         if !fits || !open.is_followed_by(piece) {
-            self.give_up(Some(index));
+            self.discard(Some(index));
             return None;
         }
         open.bytes.extend_from_slice(bytes);
@@ -87,17 +87,17 @@ impl PieceAssembler {
     }
 
     /// Keeps the buffer of a datagram that was read, for reuse.
-    pub fn reuse(&mut self, mut buffer: Vec<u8>) {
-        if buffer.capacity() > PIECE_BYTES as usize && self.spare.len() < FreshDatagrams::CAP {
+    pub fn recycle(&mut self, mut buffer: Vec<u8>) {
+        if buffer.capacity() > PIECE_BYTES as usize && self.free_buffers.len() < FreshDatagrams::CAP {
             buffer.clear();
-            self.spare.push(buffer);
+            self.free_buffers.push(buffer);
         }
     }
 
     /// Discards datagrams that have waited too long, in the kernel's clock.
     pub fn advance(&mut self, now: u64) {
         if now.saturating_sub(self.used) > PIECE_LIFETIME_NANOSECONDS {
-            self.spare = Vec::new();
+            self.free_buffers = Vec::new();
         }
         let before = self.open.len();
         self.open
@@ -115,10 +115,10 @@ impl PieceAssembler {
     #[must_use]
     pub fn bytes(&self) -> usize {
         let open: usize = self.open.iter().map(|open| open.bytes.len()).sum();
-        open + self.spare.iter().map(Vec::capacity).sum::<usize>()
+        open + self.free_buffers.iter().map(Vec::capacity).sum::<usize>()
     }
 
-    fn give_up(&mut self, index: Option<usize>) {
+    fn discard(&mut self, index: Option<usize>) {
         if index.and_then(|index| self.open.remove(index)).is_some() {
             self.given_up += 1;
         }

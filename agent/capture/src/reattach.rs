@@ -43,7 +43,7 @@ struct Shared {
     /// Why the hook is not attached.
     detached: Mutex<Option<String>>,
     /// Number of times that the hook was attached again.
-    attached_anew: AtomicU64,
+    reattachments: AtomicU64,
     progress: Progress,
 }
 
@@ -108,8 +108,8 @@ impl Reattach {
 
     /// Returns the number of attachments to another group since the start.
     #[must_use]
-    pub fn attached_anew(&self) -> u64 {
-        self.shared.attached_anew.load(Ordering::Acquire)
+    pub fn reattachments(&self) -> u64 {
+        self.shared.reattachments.load(Ordering::Acquire)
     }
 }
 
@@ -142,7 +142,7 @@ impl Follow {
                 true => WATCHED_POLL_INTERVAL,
                 false => POLL_INTERVAL,
             };
-            self.shared.progress.rest();
+            self.shared.progress.set_idle();
             let is_over = match &watch {
                 Some(watch) => wait(&[ended, watch.as_fd()], every),
                 None => wait(&[ended], every),
@@ -173,7 +173,7 @@ impl Follow {
         }
         match self.attach() {
             Ok(()) => {
-                self.shared.attached_anew.fetch_add(1, Ordering::Release);
+                self.shared.reattachments.fetch_add(1, Ordering::Release);
                 *self.detached() = None;
                 tracing::info!(
                     cgroup = %self.path.display(),

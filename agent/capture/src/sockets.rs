@@ -32,7 +32,7 @@ const MAX_REQUESTS: u8 = 3;
 pub struct Sockets {
     groups: CgroupPaths,
     known: BTreeMap<u64, Known>,
-    looked: u64,
+    last_search: u64,
     asked: u64,
     failed: bool,
 }
@@ -42,7 +42,7 @@ struct Known {
     owner: Option<Owner>,
     /// Unattributed drops when the socket's owner was first found.
     dropped_before: Option<u64>,
-    questions: u8,
+    requests: u8,
     /// Value of the hook's counter at the last report to the model.
     rcvbuf_errors: u64,
     reported: Option<SocketFacts>,
@@ -55,7 +55,7 @@ impl Sockets {
         Self {
             groups: CgroupPaths::new(hierarchy),
             known: BTreeMap::new(),
-            looked: 0,
+            last_search: 0,
             asked: 0,
             failed: false,
         }
@@ -65,10 +65,10 @@ impl Sockets {
     pub fn follow(&mut self, filter: &Filter, now: u64, observer: &mut Observer) {
         let is_awaited = observer.awaits_holders();
         let interval = if is_awaited { SHORT_SEARCH_INTERVAL } else { SEARCH_INTERVAL };
-        if now.saturating_sub(self.looked) < interval {
+        if now.saturating_sub(self.last_search) < interval {
             return;
         }
-        self.looked = now;
+        self.last_search = now;
         let met: BTreeMap<u64, Socket> = filter.sockets().collect();
         self.forget(&met, observer);
         let owners = self.owners(filter.tracepoints(), &met, now);
@@ -120,7 +120,7 @@ impl Sockets {
         let owners = inside?.owners()?;
         let unknown = |cookie: &u64| {
             let known = self.known.get(cookie);
-            known.is_none_or(|known| known.owner.is_none() && known.questions < MAX_REQUESTS)
+            known.is_none_or(|known| known.owner.is_none() && known.requests < MAX_REQUESTS)
         };
         let due = now.saturating_sub(self.asked) >= FULL_SEARCH_INTERVAL;
         if met.is_empty() || !(due || met.keys().any(unknown)) {
@@ -145,12 +145,12 @@ impl Sockets {
     ) {
         for (cookie, socket) in met {
             let known = self.known.entry(*cookie).or_default();
-            known.questions = known.questions.saturating_add(1);
+            known.requests = known.requests.saturating_add(1);
             let owner = owners.remove(cookie);
             if owner.is_none() && known.owner.is_some() {
                 // The last process that held the socket has closed it.
                 *known = Known {
-                    questions: MAX_REQUESTS,
+                    requests: MAX_REQUESTS,
                     ..Known::default()
                 };
                 observer.input(Input::SocketClosed(*cookie));
@@ -167,7 +167,7 @@ impl Sockets {
 impl Known {
     /// Returns whether a process may hold the socket open.
     const fn may_be_open(&self) -> bool {
-        self.owner.is_some() || self.questions < MAX_REQUESTS
+        self.owner.is_some() || self.requests < MAX_REQUESTS
     }
 
     /// Returns the drops of the socket beyond the attributed ones; `None` if the kernel does not
@@ -264,7 +264,7 @@ mod tests {
         let owners = BTreeMap::from([(1, owner(0)), (2, owner(0))]);
         all.poll(owners, &met, &mut observer);
         all.poll(BTreeMap::from([(2, owner(0))]), &met, &mut observer);
-        let questions = |all: &Sockets, cookie| all.known.get(&cookie).unwrap().questions;
+        let questions = |all: &Sockets, cookie| all.known.get(&cookie).unwrap().requests;
         assert_eq!(questions(&all, 1), MAX_REQUESTS);
         assert!(all.known.get(&1).unwrap().owner.is_none());
         assert_eq!(questions(&all, 2), 2);

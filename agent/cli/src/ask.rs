@@ -10,7 +10,7 @@ use anyhow::{Context as _, Result, bail};
 use ros2probe::discover::announcements::Announcements;
 use ros2probe::discover::participants::{HeardParticipant, Listening, listen};
 use ros2probe::discover::session::{MAX_PACKETS, Session, Target};
-use ros2probe::discover::{converse, local_participant};
+use ros2probe::discover::{run_session, local_participant};
 use ros2probe_daemon::agent::configuration;
 
 use crate::cli::Discover;
@@ -55,7 +55,7 @@ pub(crate) fn discover(options: &Discover) -> Result<()> {
     }
     let mut failed = 0;
     for (target, domain_id) in &targets {
-        let answered = ask(target, *domain_id, options, &mut out)?;
+        let answered = request_announcements(target, *domain_id, options, &mut out)?;
         failed += usize::from(!answered);
     }
     if failed > 0 {
@@ -85,7 +85,7 @@ fn describe(participant: &HeardParticipant) -> String {
 }
 
 /// Sends requests to one participant. Returns whether every request was answered.
-fn ask(target: &Target, domain_id: u32, options: &Discover, out: &mut impl Write) -> Result<bool> {
+fn request_announcements(target: &Target, domain_id: u32, options: &Discover, out: &mut impl Write) -> Result<bool> {
     let (local_participant, socket) = local_participant(target, domain_id)?;
     let mut session = Session::new(local_participant, *target, !options.no_nodes);
     let will = if options.dry_run { "would" } else { "will" };
@@ -103,7 +103,7 @@ fn ask(target: &Target, domain_id: u32, options: &Discover, out: &mut impl Write
     }
     // The plan is printed before anything is sent.
     out.flush()?;
-    let took = converse(&mut session, &socket)
+    let took = run_session(&mut session, &socket)
         .context("the conversation failed, perhaps before the goodbye")?;
     report(&session, took, out)
 }

@@ -6,7 +6,7 @@ use jiff::Timestamp;
 use jiff::tz::TimeZone;
 use ros2probe_api::why::{LateCall, LateCallback, OtherThread, Part, Why};
 
-use crate::top::text::{counted, safe, seconds};
+use crate::top::text::{counted, escaped, seconds};
 
 /// Width of a drawn bar, in characters.
 const BAR_WIDTH: usize = 48;
@@ -39,22 +39,22 @@ pub fn text(why: &Why<'_>, zone: &TimeZone) -> String {
             "{:>4} of {all}, up to {}: {}",
             cause.late_calls,
             seconds(cause.longest_seconds),
-            safe(&cause.words)
+            escaped(&cause.words)
         );
-        let _ = writeln!(out, "     > {}", safe(&cause.remedy));
+        let _ = writeln!(out, "     > {}", escaped(&cause.remedy));
     }
     if let Some(reason) = &why.reason {
-        let _ = writeln!(out, "not everything is observed: {}", safe(reason));
+        let _ = writeln!(out, "not everything is observed: {}", escaped(reason));
     }
     for callback in &why.callbacks {
         out.push('\n');
-        text_of(callback, zone, &mut out);
+        write_callback(callback, zone, &mut out);
     }
     out
 }
 
-fn text_of(callback: &LateCallback<'_>, zone: &TimeZone, out: &mut String) {
-    let node = callback.owner.node.as_deref().map(safe);
+fn write_callback(callback: &LateCallback<'_>, zone: &TimeZone, out: &mut String) {
+    let node = callback.owner.node.as_deref().map(escaped);
     let node = node.unwrap_or_else(|| format!("process {}", callback.owner.process_id));
     let calls = callback.calls.map_or_else(
         || counted(callback.late_calls, "late call"),
@@ -63,14 +63,14 @@ fn text_of(callback: &LateCallback<'_>, zone: &TimeZone, out: &mut String) {
     let _ = writeln!(
         out,
         "{node}, callback of {}: {calls}",
-        safe(&callback.trigger.words())
+        escaped(&callback.trigger.words())
     );
     if let Some(worst) = callback.examples.first() {
-        worst_call(worst, zone, out);
+        write_worst_call(worst, zone, out);
     }
 }
 
-fn worst_call(call: &LateCall<'_>, zone: &TimeZone, out: &mut String) {
+fn write_worst_call(call: &LateCall<'_>, zone: &TimeZone, out: &mut String) {
     let wait = call.wait_seconds.unwrap_or_default();
     let total = wait + call.duration_seconds;
     let _ = writeln!(
@@ -80,7 +80,7 @@ fn worst_call(call: &LateCall<'_>, zone: &TimeZone, out: &mut String) {
         time(call.timestamp_seconds, zone),
         call.thread_id,
         call.cpu,
-        safe(&call.words)
+        escaped(&call.words)
     );
     for (stage, words) in STAGES {
         let parts = call.parts.iter().filter(|part| part.stage == stage);
@@ -91,7 +91,7 @@ fn worst_call(call: &LateCall<'_>, zone: &TimeZone, out: &mut String) {
                 out,
                 "  {words:<17} {:>6}  {}",
                 seconds(sum),
-                listed(&parts, total)
+                part_list(&parts, total)
             );
         }
     }
@@ -105,7 +105,7 @@ fn worst_call(call: &LateCall<'_>, zone: &TimeZone, out: &mut String) {
             0 => format!("no one (idle CPU) {}", seconds(other.seconds)),
             _ => format!(
                 "{} {}",
-                named(other, other.process_id.to_string()),
+                thread_in_words(other, other.process_id.to_string()),
                 seconds(other.seconds)
             ),
         })
@@ -119,13 +119,13 @@ fn worst_call(call: &LateCall<'_>, zone: &TimeZone, out: &mut String) {
         .filter(|it| it.seconds >= total * MIN_NAMED_SHARE)
     {
         let system_call = match &blocked.system_call {
-            Some(name) => format!("{}({})", safe(name), safe(&blocked.argument)),
+            Some(name) => format!("{}({})", escaped(name), escaped(&blocked.argument)),
             None => "no system call".to_owned(),
         };
         let ended = blocked.ended_by.as_ref().map(|by| {
             format!(
                 ", ended by {}",
-                named(by, format!("thread {}", by.thread_id))
+                thread_in_words(by, format!("thread {}", by.thread_id))
             )
         });
         let _ = writeln!(
@@ -136,7 +136,7 @@ fn worst_call(call: &LateCall<'_>, zone: &TimeZone, out: &mut String) {
         );
     }
     if !call.cpu_limits.is_empty() {
-        let limits: Vec<_> = call.cpu_limits.iter().map(|limit| safe(limit)).collect();
+        let limits: Vec<_> = call.cpu_limits.iter().map(|limit| escaped(limit)).collect();
         let _ = writeln!(out, "  slow CPUs: {}", limits.join("; "));
     }
     let others = call
@@ -152,26 +152,26 @@ fn worst_call(call: &LateCall<'_>, zone: &TimeZone, out: &mut String) {
         let _ = writeln!(
             out,
             "  waited for {several} of {}: {}",
-            safe(&previous.trigger.words()),
+            escaped(&previous.trigger.words()),
             seconds(previous.duration_seconds)
         );
     }
 }
 
 /// Returns a thread with its id in words, its unit, and a priority other than the usual one.
-fn named(other: &OtherThread<'_>, id: String) -> String {
+fn thread_in_words(other: &OtherThread<'_>, id: String) -> String {
     let mut facts = vec![id];
-    facts.extend(other.unit.as_deref().map(safe));
+    facts.extend(other.unit.as_deref().map(escaped));
     let priority = other.priority.as_deref().filter(|it| *it != "nice 0");
-    facts.extend(priority.map(safe));
-    format!("{} ({})", safe(&other.name), facts.join(", "))
+    facts.extend(priority.map(escaped));
+    format!("{} ({})", escaped(&other.name), facts.join(", "))
 }
 
 /// Returns the parts that are not small, with their lengths.
-fn listed(parts: &[&Part<'_>], total: f64) -> String {
+fn part_list(parts: &[&Part<'_>], total: f64) -> String {
     let shown = parts.iter().filter(|part| part.seconds >= total * MIN_NAMED_SHARE);
     let words: Vec<_> = shown
-        .map(|part| format!("{} {}", safe(&part.cause), seconds(part.seconds)))
+        .map(|part| format!("{} {}", escaped(&part.cause), seconds(part.seconds)))
         .collect();
     words.join(", ")
 }

@@ -20,7 +20,7 @@ const SOCKET_NAME: &str = "api.sock";
 
 /// Applies the command line to the configuration. By default, a report has no listener, since it
 /// ends before a client could connect.
-pub(crate) fn choose(
+pub(crate) fn apply_options(
     settings: &mut ApiSettings,
     asked: Option<Listen>,
     loopback: Option<Access>,

@@ -112,7 +112,7 @@ impl LimitFigures {
         for (rise, limit) in rises.iter_mut().zip(Limit::ALL) {
             let (_, count) = self.usage(limit, state);
             if count > rise.count {
-                rise.at = Some(state.agent.at);
+                rise.at = Some(state.agent.collected_at);
             }
             rise.count = count;
         }
@@ -122,7 +122,7 @@ impl LimitFigures {
     #[must_use]
     pub fn facts(&self, state: &State) -> [LimitFacts; LIMIT_COUNT] {
         let rises = *self.rises.lock().unwrap_or_else(PoisonError::into_inner);
-        let is_recent = |at: Instant| state.agent.at.saturating_duration_since(at) < REACHED_FOR;
+        let is_recent = |at: Instant| state.agent.collected_at.saturating_duration_since(at) < REACHED_FOR;
         Limit::ALL.map(|limit| {
             let (used, reached) = self.usage(limit, state);
             let cap = self.caps.get(limit) as u64;

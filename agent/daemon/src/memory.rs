@@ -64,7 +64,7 @@ pub(crate) fn load(directory: &StateDirectory) -> (Option<Memory>, bool) {
     let path = directory.path().display();
     let known = match directory.load() {
         Loaded::Newer(newer) => {
-            left_alone(&newer);
+            log_newer_state(&newer);
             return (None, false);
         }
         Loaded::Known(memory) => {
@@ -87,7 +87,7 @@ pub(crate) fn load(directory: &StateDirectory) -> (Option<Memory>, bool) {
 }
 
 /// Logs that state of a newer version is preserved, since the operator may upgrade again.
-fn left_alone(newer: &Newer) {
+fn log_newer_state(newer: &Newer) {
     let Newer {
         path,
         version,
@@ -125,7 +125,7 @@ fn load_watches(directory: &StateDirectory) -> Option<Vec<Watch>> {
     Some(match watches::load(directory) {
         LoadedWatches::Nothing => Vec::new(),
         LoadedWatches::Newer(newer) => {
-            left_alone(&newer);
+            log_newer_state(&newer);
             return None;
         }
         LoadedWatches::These(watches) => {

@@ -32,7 +32,7 @@ pub struct PrivateAgent {
 impl PrivateAgent {
     /// Changes the configuration: no address is bound, nothing outside the directory is written,
     /// and every topic of the domain is measured.
-    pub(crate) fn apply(&self, config: &mut Config) {
+    pub(crate) fn restrict(&self, config: &mut Config) {
         config.metrics.listen = None;
         config.foxglove.listen = None;
         config.api.listen = None;
@@ -117,7 +117,7 @@ mod tests {
             domain_id: DomainId(7),
             parent: 1,
         };
-        private.apply(&mut config);
+        private.restrict(&mut config);
         config
     }
 

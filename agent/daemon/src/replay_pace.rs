@@ -32,7 +32,7 @@ pub enum Jump {
 impl Pace {
     /// Returns whether the replay stands still.
     #[must_use]
-    pub const fn is_still(&self) -> bool {
+    pub const fn is_paused(&self) -> bool {
         self.is_paused && self.jump.is_none()
     }
 

@@ -38,7 +38,7 @@ pub struct SnapshotCell {
     past_wanted: AtomicU8,
     /// Whether a reader waits for a newer state.
     asked: AtomicBool,
-    /// Whether the state was read since [`Self::was_read`].
+    /// Whether the state was read since [`Self::was_snapshot_read`].
     read: AtomicBool,
     /// Time at which a client last needed calls inside processes.
     calls_wanted: ArcSwapOption<Instant>,
@@ -85,7 +85,7 @@ impl CaptureBell {
         }
     }
 
-    /// Returns the descriptor that is readable after [`Self::ring`] until [`Self::silence`]; `None`
+    /// Returns the descriptor that is readable after [`Self::ring`] until [`Self::drain`]; `None`
     /// without a socket pair.
     #[must_use]
     pub fn descriptor(&self) -> Option<BorrowedFd<'_>> {
@@ -95,7 +95,7 @@ impl CaptureBell {
     /// Discards all rings so far.
     pub fn silence(&self) {
         if let Some(bell) = &self.0 {
-            bell.silence();
+            bell.drain();
         }
     }
 }
@@ -142,12 +142,12 @@ impl SnapshotCell {
 
     /// Returns whether the state was read since the last call.
     #[must_use]
-    pub fn was_read(&self) -> bool {
+    pub fn was_snapshot_read(&self) -> bool {
         self.read.swap(false, Ordering::Relaxed)
     }
 
     /// Notes that a client needs calls inside processes.
-    pub fn want_calls(&self) {
+    pub fn request_calls(&self) {
         let before = self.calls_wanted.swap(Some(Arc::new(Instant::now())));
         if before.is_none_or(|before| before.elapsed() > REQUEST_LIFETIME) {
             self.bell.ring();
@@ -156,7 +156,7 @@ impl SnapshotCell {
 
     /// Returns whether a client needed calls inside processes lately.
     #[must_use]
-    pub fn are_calls_wanted(&self, now: Instant) -> bool {
+    pub fn are_calls_requested(&self, now: Instant) -> bool {
         let wanted = self.calls_wanted.load();
         let age = wanted
             .as_deref()
@@ -166,8 +166,8 @@ impl SnapshotCell {
 
     /// Notes that a client requests the causes of late calls. With `above`, calls of callbacks of
     /// this topic or node, or of all, are late if they take longer.
-    pub fn want_late(&self, name: Option<&str>, above: Option<Duration>) {
-        self.want_calls();
+    pub fn request_late_calls(&self, name: Option<&str>, above: Option<Duration>) {
+        self.request_calls();
         let mut questions = self.late_questions();
         questions.retain(|question| question.at.elapsed() <= REQUEST_LIFETIME);
         let is_same = |question: &LateQuestion| question.name.as_deref() == name;
@@ -219,7 +219,7 @@ impl SnapshotCell {
 
     /// Counts one second, and returns whether the last seconds were read lately.
     #[must_use]
-    pub fn wants_past(&self) -> bool {
+    pub fn is_history_requested(&self) -> bool {
         let left = self.past_wanted.load(Ordering::Relaxed);
         // A race with a reader only shifts the end of publishing by a second.
         self.past_wanted
@@ -318,7 +318,7 @@ impl State {
     pub fn ready(&self, now: Instant) -> Result<(), Unready> {
         self.progresses(now)?;
         let agent = &self.agent;
-        let unseen = agent.gone.as_ref().or(agent.stalled.as_ref());
+        let unseen = agent.missing_object.as_ref().or(agent.stalled.as_ref());
         let unseen = unseen.or(agent.pending.as_ref());
         unseen.map_or(Ok(()), |reason| Err(Unready::Unseen(reason.clone())))
     }
@@ -339,7 +339,7 @@ impl State {
         if stuck > MAX_FRESH_AGE {
             return Err(Unready::NoProgress(stuck.as_secs()));
         }
-        let age = now.saturating_duration_since(self.agent.at);
+        let age = now.saturating_duration_since(self.agent.collected_at);
         if age > MAX_FRESH_AGE {
             return Err(Unready::Outdated(age.as_secs()));
         }
@@ -391,7 +391,7 @@ mod tests {
         let mut state = State {
             snapshot: Some(Arc::default()),
             agent: AgentFacts {
-                gone: Some(gone.clone()),
+                missing_object: Some(gone.clone()),
                 ..AgentFacts::new(SourceKind::Host, start)
             },
         };
@@ -399,7 +399,7 @@ mod tests {
         assert_eq!(state.progresses(start), Ok(()));
         let later = start + Duration::from_hours(1);
         assert!(state.progresses(later).is_err());
-        state.agent.gone = None;
+        state.agent.missing_object = None;
         assert_eq!(state.ready(start), Ok(()));
         // A part that makes no progress has the same effect.
         let stalled = "capture.inside: its thread has made no progress for 5 s".to_owned();
@@ -438,17 +438,17 @@ mod tests {
             ..Snapshot::default()
         };
         cell.publish(snapshot, at(0));
-        assert!(!cell.was_read());
+        assert!(!cell.was_snapshot_read());
         let mut publication = Box::pin(cell.published());
         assert!(futures_util::poll!(&mut publication).is_pending());
         cell.refresh(Duration::ZERO).await;
         cell.publish_agent(at(3));
         assert!(futures_util::poll!(&mut publication).is_pending() && cell.is_asked());
         let own = cell.own_state();
-        assert_eq!((own.known().records, own.agent.at), (7, at(3).at));
-        assert!(!cell.was_read(), "the snapshot was not read");
+        assert_eq!((own.known().records, own.agent.collected_at), (7, at(3).collected_at));
+        assert!(!cell.was_snapshot_read(), "the snapshot was not read");
         assert_eq!(cell.state().known().records, 7);
-        assert!(cell.was_read() && !cell.was_read());
+        assert!(cell.was_snapshot_read() && !cell.was_snapshot_read());
         cell.publish(Snapshot::default(), at(4));
         publication.await;
     }
@@ -473,20 +473,20 @@ mod tests {
     #[test]
     fn the_last_seconds_are_published_for_some_seconds_after_they_were_read() {
         let cell = SnapshotCell::new(SourceKind::Wire);
-        assert!(!cell.wants_past());
+        assert!(!cell.is_history_requested());
         let _ = cell.past();
-        let wanted = (0..100).filter(|_| cell.wants_past()).count();
+        let wanted = (0..100).filter(|_| cell.is_history_requested()).count();
         assert_eq!(wanted, usize::from(PAST_SECONDS));
         let _ = cell.past();
-        assert!(cell.wants_past());
+        assert!(cell.is_history_requested());
     }
 
     #[test]
     fn calls_are_wanted_until_ten_seconds_after_the_last_request() {
         let cell = SnapshotCell::new(SourceKind::Host);
-        let after = |seconds| cell.are_calls_wanted(Instant::now() + Duration::from_secs(seconds));
+        let after = |seconds| cell.are_calls_requested(Instant::now() + Duration::from_secs(seconds));
         assert!(!after(0));
-        cell.want_calls();
+        cell.request_calls();
         let rings = cell.bell().descriptor().unwrap();
         assert_eq!(wait(&[rings], Duration::ZERO).unwrap(), Some(0));
         assert!(after(0) && after(9) && !after(11));
@@ -498,10 +498,10 @@ mod tests {
         let after = |seconds| cell.late_demand(Instant::now() + Duration::from_secs(seconds));
         assert_eq!(after(0), LateDemand::default());
         let above = |milliseconds| Some(Duration::from_millis(milliseconds));
-        cell.want_late(Some("/scan"), above(5));
-        cell.want_late(Some("/scan"), above(7));
+        cell.request_late_calls(Some("/scan"), above(5));
+        cell.request_late_calls(Some("/scan"), above(7));
         for _ in 0..100 {
-            cell.want_late(None, None);
+            cell.request_late_calls(None, None);
         }
         let demand = after(9);
         assert!(demand.has_question);
@@ -514,7 +514,7 @@ mod tests {
     fn questions_about_many_names_are_bounded() {
         let cell = SnapshotCell::new(SourceKind::Host);
         for number in 0..1000 {
-            cell.want_late(Some(&format!("/topic_{number}")), Some(Duration::ZERO));
+            cell.request_late_calls(Some(&format!("/topic_{number}")), Some(Duration::ZERO));
         }
         let bounds = cell.late_demand(Instant::now()).bounds;
         assert_eq!(bounds.len(), MAX_LATE_QUESTIONS);

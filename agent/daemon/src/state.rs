@@ -244,7 +244,7 @@ impl StateDirectory {
             .and_then(|file| file.take(MAX_BYTES + 1).read_to_end(&mut bytes));
         match read {
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Found::Nothing,
-            Err(error) => return self.set_aside(file, error.to_string()),
+            Err(error) => return self.move_aside(file, error.to_string()),
             Ok(_) => {}
         }
         let known = form.readers.last().map_or(0, |(version, _)| *version);
@@ -254,8 +254,8 @@ impl StateDirectory {
             Err(error) => match begins_with_version(&bytes) {
                 // The file is too large or not JSON, but a newer version may be able to read it.
                 Some(version) if version > known => version,
-                _ if is_whole => return self.set_aside(file, error.to_string()),
-                _ => return self.set_aside(file, format!("it is larger than {MAX_BYTES} bytes")),
+                _ if is_whole => return self.move_aside(file, error.to_string()),
+                _ => return self.move_aside(file, format!("it is larger than {MAX_BYTES} bytes")),
             },
         };
         if version > known {
@@ -268,14 +268,14 @@ impl StateDirectory {
         match form.readers.iter().find(|(reads, _)| *reads == version) {
             Some((_, read)) => match read(&bytes) {
                 Ok(document) => Found::This(document),
-                Err(error) => self.set_aside(file, error.to_string()),
+                Err(error) => self.move_aside(file, error.to_string()),
             },
-            None => self.set_aside(file, format!("version {version} is not supported")),
+            None => self.move_aside(file, format!("version {version} is not supported")),
         }
     }
 
     /// Moves an unusable file aside.
-    pub(crate) fn set_aside<T>(&self, file: &str, reason: String) -> Found<T> {
+    pub(crate) fn move_aside<T>(&self, file: &str, reason: String) -> Found<T> {
         let aside = self.path.join(format!("{file}.corrupt"));
         let moved = fs::rename(self.path.join(file), &aside);
         Found::Unusable {
@@ -385,7 +385,7 @@ impl StateWriter {
 
     /// Returns whether the state at `revision` should be passed to [`Self::keep`] now.
     #[must_use]
-    pub fn wants(&self, revision: u64, now: Instant) -> bool {
+    pub fn is_write_due(&self, revision: u64, now: Instant) -> bool {
         let is_failing = self.done.is_failing.load(Ordering::Relaxed);
         self.handed.is_none_or(|(handed, at)| {
             let age = now.saturating_duration_since(at);
@@ -461,7 +461,7 @@ fn keep(
     while let Ok(memory) = inbox.recv() {
         done.progress.step();
         let written = write(memory);
-        done.progress.rest();
+        done.progress.set_idle();
         let failed_before = done.is_failing.swap(written.is_err(), Ordering::Relaxed);
         match written {
             Ok(()) => {

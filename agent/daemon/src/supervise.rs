@@ -63,7 +63,7 @@ pub(crate) struct Surfaces {
     pub(crate) viewers: Option<foxglove::Server>,
     pub(crate) context: api::Context,
     /// Proof that the serving thread has no privilege.
-    pub(crate) powerless: Unprivileged,
+    pub(crate) unprivileged: Unprivileged,
 }
 
 /// End of a thread; an error if it panicked.
@@ -229,7 +229,7 @@ impl Supervisor {
         }
         let done = Config::load(file)
             .map_err(|error| mistakes(&error))
-            .and_then(|config| self.take_over(&config));
+            .and_then(|config| self.apply_reload(&config));
         let _ = sd_notify::notify(&[NotifyState::Ready]);
         done.map_err(|mistakes| {
             let error = mistakes.join("\n");
@@ -244,7 +244,7 @@ impl Supervisor {
         })
     }
 
-    fn take_over(&mut self, config: &Config) -> Result<Reloaded, Vec<String>> {
+    fn apply_reload(&mut self, config: &Config) -> Result<Reloaded, Vec<String>> {
         let configured = self.watches.configure(config.watches.clone());
         configured.map_err(|error| vec![error.to_string()])?;
         let needs_restart = self.config.needs_restart(config);
@@ -252,7 +252,7 @@ impl Supervisor {
             tracing::warn!(key, "the change takes effect after a restart");
         }
         self.log.set(config.log);
-        let in_force = self.watches.in_force();
+        let in_force = self.watches.active();
         let shown = in_force.watchlist().watches().to_vec();
         let watches = shown.len();
         self.sources.events.record(AgentEvent::Reloaded { watches });
@@ -325,7 +325,7 @@ impl Surfaces {
     /// Answers requests until the agent stops.
     fn answer(self) -> Result<()> {
         // Capabilities belong to threads, so those of this thread are verified, too.
-        let _: (Unprivileged, Unprivileged) = (self.powerless, Unprivileged::verify()?);
+        let _: (Unprivileged, Unprivileged) = (self.unprivileged, Unprivileged::verify()?);
         // Blocking threads create bags for clients; the unit allows 32 threads in total.
         let runtime = tokio::runtime::Builder::new_current_thread()
             .max_blocking_threads(4)
@@ -400,9 +400,9 @@ impl Worker {
 /// Notifies the service manager while the agent observes.
 struct Watchdog {
     period: Option<Duration>,
-    fed: Option<Instant>,
+    last_notification: Option<Instant>,
     ready: bool,
-    sight: SourceMonitor,
+    last_state: SourceMonitor,
 }
 
 impl Watchdog {
@@ -411,9 +411,9 @@ impl Watchdog {
         let period = sd_notify::watchdog_enabled().map(|allowed| allowed / 3);
         Self {
             period,
-            fed: None,
+            last_notification: None,
             ready: false,
-            sight: SourceMonitor::default(),
+            last_state: SourceMonitor::default(),
         }
     }
 
@@ -423,7 +423,7 @@ impl Watchdog {
         let now = Instant::now();
         let state = latest.own_state();
         let ready = state.ready(now);
-        for event in self.sight.check(&ready, state.agent.attached_anew, now) {
+        for event in self.last_state.check(&ready, state.agent.reattachments, now) {
             events.record(event);
         }
         // A missing target does not stop the watchdog, since a restart cannot restore it.
@@ -440,10 +440,10 @@ impl Watchdog {
             return first;
         };
         if self
-            .fed
+            .last_notification
             .is_none_or(|fed| now.saturating_duration_since(fed) >= period)
         {
-            self.fed = Some(now);
+            self.last_notification = Some(now);
             let _ = sd_notify::notify(&[NotifyState::Watchdog]);
         }
         first

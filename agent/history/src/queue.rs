@@ -68,7 +68,7 @@ impl Queue {
     ///
     /// Fails if the directory cannot be read.
     pub fn open(directory: &Path, limit: u64) -> io::Result<Self> {
-        let kept = kept_place(directory);
+        let kept = read_place(directory);
         let waiting = kept.unwrap_or(Place(0, 0));
         let mut found = Vec::new();
         match fs::read_dir(directory) {
@@ -276,7 +276,7 @@ impl Queue {
 }
 
 /// Returns the place of the oldest waiting record, as [`Queue::remove`] keeps it.
-fn kept_place(directory: &Path) -> Option<Place> {
+fn read_place(directory: &Path) -> Option<Place> {
     let text = fs::read_to_string(directory.join(PLACE_FILE)).ok()?;
     let (file, place) = text.trim().split_once(' ')?;
     Some(Place(file.parse().ok()?, place.parse().ok()?))

@@ -320,7 +320,7 @@ impl Store {
     ) {
         self.visit(tier, kind, times, &mut |block| {
             columns::read(&block.content, wanted, &mut |name, row: R| {
-                if row.at() > times.start && row.at() <= times.end {
+                if row.end_time() > times.start && row.end_time() <= times.end {
                     each(name, row);
                 }
             });

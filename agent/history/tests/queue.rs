@@ -198,7 +198,7 @@ proptest! {
 }
 
 #[test]
-fn after_a_power_cut_records_of_a_new_file_wait_whatever_place_was_kept() {
+fn after_a_power_cut_all_records_of_a_new_file_are_waiting() {
     let place = tempfile::tempdir().unwrap();
     let directory = place.path().join("queue");
     let mut queue = Queue::open(&directory, LIMIT).unwrap();

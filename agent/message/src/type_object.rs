@@ -361,7 +361,7 @@ fn identifier(cursor: &mut Cursor<'_>, depth: usize) -> Result<Reference, NotUsa
                 0x80 => bound(cursor, is_large)?.map_or(Shape::Unbounded, Shape::Bounded),
                 _ => Shape::Array(dimensions(cursor, is_large)?),
             };
-            return identifier(cursor, depth + 1)?.within(shape);
+            return identifier(cursor, depth + 1)?.in_collection(shape);
         }
         EK_COMPLETE => Target::Type(EquivalenceHash(cursor.array("equivalence_hash")?)),
         EK_MINIMAL => return Err(NotUsable::Kind("a minimal type")),
@@ -409,7 +409,7 @@ fn product(one: u32, other: u32) -> Result<u32, NotUsable> {
 
 impl Reference {
     /// Returns a collection of this. Arrays of arrays are one array on the wire.
-    fn within(self, shape: Shape) -> Result<Self, NotUsable> {
+    fn in_collection(self, shape: Shape) -> Result<Self, NotUsable> {
         let shape = match (shape, self.shape) {
             (shape, Shape::Single) | (Shape::Single, shape) => shape,
             (Shape::Array(outer), Shape::Array(inner)) => Shape::Array(product(outer, inner)?),

@@ -221,7 +221,7 @@ impl Writer<'_> {
         } else {
             forms.block_plain
         };
-        if plain && !text.is_empty() && !reads_as_other(text) {
+        if plain && !text.is_empty() && !is_other_type(text) {
             self.text.push_str(text);
         } else if forms.single_quoted {
             self.single_quoted(text, indent);
@@ -322,7 +322,7 @@ fn float(number: f64) -> String {
 }
 
 /// Returns whether the plain text would be read as a number, boolean, null or time.
-fn reads_as_other(text: &str) -> bool {
+fn is_other_type(text: &str) -> bool {
     static OTHER_TYPE_PATTERN: LazyLock<Option<Regex>> = LazyLock::new(|| {
         let float =
             r"[-+]?[0-9][0-9_]*\.[0-9_]*(?:[eE][-+][0-9]+)?|\.[0-9][0-9_]*(?:[eE][-+][0-9]+)?";

@@ -336,7 +336,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bag_that_was_just_changed_or_lacks_a_file_is_no_complete_one() {
+    fn a_bag_that_just_changed_or_misses_a_file_is_incomplete() {
         let directory = tempfile::tempdir().unwrap();
         let root = directory.path();
         write(root, "lap", false).close(BTreeMap::new()).unwrap();

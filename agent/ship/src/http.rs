@@ -169,7 +169,7 @@ impl Body for Paced {
         }
         let length = self.rest.len().min(PIECE_BYTES);
         if self.turn.is_none() {
-            self.turn = Some(Box::pin(sleep_until(self.link.turn(length))));
+            self.turn = Some(Box::pin(sleep_until(self.link.reserve(length))));
         }
         if let Some(turn) = &mut self.turn
             && turn.as_mut().poll(context).is_pending()

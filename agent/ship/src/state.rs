@@ -275,7 +275,7 @@ mod tests {
     }
 
     #[test]
-    fn a_damaged_record_is_as_none_and_one_process_works_at_a_time() {
+    fn a_damaged_record_is_ignored_and_a_second_process_is_locked_out() {
         let root = tempfile::tempdir().unwrap();
         fs::create_dir(root.path().join(BAGS_DIRECTORY)).unwrap();
         fs::write(root.path().join(BAGS_DIRECTORY).join("lap.json"), "{\"fingerp").unwrap();
@@ -286,7 +286,7 @@ mod tests {
     }
 
     #[test]
-    fn a_record_beyond_the_cap_is_as_none() {
+    fn a_record_beyond_the_size_limit_is_ignored() {
         let root = tempfile::tempdir().unwrap();
         fs::create_dir(root.path().join(BAGS_DIRECTORY)).unwrap();
         let mut text = serde_json::to_string(&Delivery::default()).unwrap();

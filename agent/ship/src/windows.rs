@@ -52,7 +52,7 @@ impl Window {
 impl Windows {
     /// Returns the time until a window opens; zero if one is open.
     #[must_use]
-    pub fn opens_in(&self, now: Time) -> Duration {
+    pub fn time_to_opening(&self, now: Time) -> Duration {
         let second = u64::from(now.second().unsigned_abs());
         let minute =
             u32::from(now.hour().unsigned_abs()) * 60 + u32::from(now.minute().unsigned_abs());
@@ -102,18 +102,18 @@ mod tests {
             (6, 0, 16 * 3_600),
             (21, 59, 60),
         ] {
-            let opens = night.opens_in(time(hour, minute, 0, 0));
+            let opens = night.time_to_opening(time(hour, minute, 0, 0));
             assert_eq!(opens, Duration::from_secs(wait), "{hour}:{minute}");
         }
         let both = windows(&["22:00-06:00", "12:00-13:00"]);
-        assert_eq!(both.opens_in(time(12, 30, 0, 0)), Duration::ZERO);
-        assert_eq!(both.opens_in(time(11, 59, 30, 0)), Duration::from_secs(30));
+        assert_eq!(both.time_to_opening(time(12, 30, 0, 0)), Duration::ZERO);
+        assert_eq!(both.time_to_opening(time(11, 59, 30, 0)), Duration::from_secs(30));
         assert_eq!(
-            Windows::default().opens_in(time(3, 0, 0, 0)),
+            Windows::default().time_to_opening(time(3, 0, 0, 0)),
             Duration::ZERO
         );
         assert_eq!(
-            windows(&["20:00-24:00"]).opens_in(time(0, 0, 0, 0)),
+            windows(&["20:00-24:00"]).time_to_opening(time(0, 0, 0, 0)),
             Duration::from_secs(20 * 3_600)
         );
     }
@@ -148,9 +148,9 @@ mod tests {
             let end = (begin + length) % MINUTES_PER_DAY;
             let windows = Windows(vec![Window { begin, end }]);
             let now = time(hour, minute, second, 0);
-            let wait = windows.opens_in(now);
+            let wait = windows.time_to_opening(now);
             let then = now.wrapping_add(jiff::SignedDuration::try_from(wait).unwrap());
-            prop_assert_eq!(windows.opens_in(then), Duration::ZERO);
+            prop_assert_eq!(windows.time_to_opening(then), Duration::ZERO);
             let minute = hour as u32 * 60 + minute as u32;
             let is_inside = (minute + MINUTES_PER_DAY - begin) % MINUTES_PER_DAY < length;
             prop_assert_eq!(wait == Duration::ZERO, is_inside);

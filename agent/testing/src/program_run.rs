@@ -6,7 +6,7 @@ use std::ops::RangeInclusive;
 use std::os::fd::{AsRawFd as _, BorrowedFd};
 use std::time::Duration;
 
-use ros2probe_capture::ahead::{Ahead, Ready};
+use ros2probe_capture::ahead::{Ahead, ReadyItem};
 use ros2probe_capture::filter::{Filter, FilterSettings};
 use ros2probe_capture::reassembly::{FlowKey, Limits, Reassembly};
 use ros2probe_wire::filter::{Budget, Counter};
@@ -134,12 +134,12 @@ impl Kernel {
             self.ahead.record(0, record, |each| ready.push(each));
         }
         let mut records = Vec::new();
-        let rest_came = ready.iter().any(|each| matches!(each, Ready::Rest(_)));
+        let rest_came = ready.iter().any(|each| matches!(each, ReadyItem::Rest(_)));
         for each in ready {
             match each {
-                Ready::Record(record) if rest_came => self.rest.push(record),
-                Ready::Record(record) => records.push(record),
-                Ready::Rest(rest) => {
+                ReadyItem::Record(record) if rest_came => self.rest.push(record),
+                ReadyItem::Record(record) => records.push(record),
+                ReadyItem::Rest(rest) => {
                     let handover = rest.handover.map(|record| record.handover());
                     let envelope = Envelope::default();
                     walk::datagram(rest.payload(), &envelope, handover.as_ref(), |found| {
@@ -174,7 +174,7 @@ impl Kernel {
         found.unwrap().1
     }
 
-    fn keep(&mut self, packet: &[u8], ready: &mut Vec<Ready>) {
+    fn keep(&mut self, packet: &[u8], ready: &mut Vec<ReadyItem>) {
         let protocol = if packet[0] >> 4 == 4 { 0x0800 } else { 0x86dd };
         let len = u32::try_from(packet.len()).unwrap();
         let Ok(Some(parsed)) = frame::parse_cooked(protocol, PacketType::HOST, packet, len) else {

@@ -310,7 +310,7 @@ mod tests {
     }
 
     #[test]
-    fn the_longest_answers_fit_a_packet() {
+    fn the_longest_answers_do_not_exceed_a_packet() {
         let mapped = Mapped {
             id: crate::mapped::LibraryId {
                 device: "ffff:ffff".to_owned(),

@@ -21,7 +21,7 @@ pub(super) struct Topic {
     /// Whether the topic has messages; its description is then fixed.
     pub(super) is_written: bool,
     /// All publishers, if they changed after the first message.
-    pub(super) later: Option<Vec<Qos>>,
+    pub(super) latest_qos: Option<Vec<Qos>>,
 }
 
 #[derive(Clone, Debug)]

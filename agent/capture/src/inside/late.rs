@@ -431,7 +431,7 @@ pub(super) fn convert(
             wait: blocked(&call.stop, unit_of),
         }),
         source: (call.source_timestamp != 0).then_some(Timestamp(call.source_timestamp)),
-        started: clocks.calendar(call.started),
+        started: clocks.wall_time_of(call.started),
         duration: between(call.started, call.ended),
         wait: (call.delay != 0).then(|| Duration::from_nanos(call.delay)),
         bound: LateBound { duration, wait },

@@ -65,7 +65,7 @@ pub struct Facts {
     /// Why nothing is attached at present; `None` = the libraries in use have probes.
     pub detached: Option<String>,
     /// Whether calls are observed on demand, and no client needs them.
-    pub is_resting: bool,
+    pub is_idle: bool,
     /// Whether calls have been observed for long enough to show rates.
     pub shows_rates: bool,
     /// What is observed about late calls: `off`, `sums` or `events`.
@@ -131,14 +131,14 @@ impl Inside {
         // A node announces its publishers only once, so the probes are attached to installed
         // libraries in advance.
         probes.install(Instant::now(), &mut broker);
-        progress.rest();
+        progress.set_idle();
         let scope = cgroup.map_or(Scope::AllProcesses, |path| {
             Scope::Cgroup(path.to_path_buf())
         });
         let facts = Facts {
             has_callbacks,
             is_on_demand,
-            is_resting: is_on_demand,
+            is_idle: is_on_demand,
             ..Facts::default()
         };
         Ok(Self {
@@ -194,7 +194,7 @@ impl Inside {
     }
 
     /// Sets what clients want to know about late calls.
-    pub fn want_late(&self, demand: &LateDemand) {
+    pub fn set_late_demand(&self, demand: &LateDemand) {
         let mut known = self.shared.late();
         if *known != *demand {
             let is_first = demand.has_question && !known.has_question;
@@ -238,7 +238,7 @@ impl Shared {
         rounds.unwrap_or_else(PoisonError::into_inner).is_full()
     }
 
-    fn put(&self, round: Round) {
+    fn store_round(&self, round: Round) {
         let rounds = self.rounds.lock();
         let mut rounds = rounds.unwrap_or_else(PoisonError::into_inner);
         rounds.push(round);
@@ -275,7 +275,7 @@ mod tests {
             stop: AtomicBool::new(false),
         };
         for _ in 0..10 {
-            shared.put(Round {
+            shared.store_round(Round {
                 report: Report::default(),
                 publications: Vec::new(),
                 hits: 0,

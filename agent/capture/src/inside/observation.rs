@@ -91,15 +91,15 @@ impl Probes {
 
     /// Detaches the probes at calls.
     fn detach(&mut self) {
-        self.at_calls_mut().clear();
+        self.call_probes_mut().clear();
     }
 
-    fn at_calls_mut(&mut self) -> &mut Attachments<Attached> {
+    fn call_probes_mut(&mut self) -> &mut Attachments<Attached> {
         self.on_demand.as_mut().unwrap_or(&mut self.lasting)
     }
 
     /// Returns the probes at calls.
-    fn at_calls(&self) -> &Attachments<Attached> {
+    fn call_probes(&self) -> &Attachments<Attached> {
         self.on_demand.as_ref().unwrap_or(&self.lasting)
     }
 
@@ -107,7 +107,7 @@ impl Probes {
     fn facts(&self, is_resting: bool) -> Vec<LibraryFacts> {
         match is_resting {
             true => self.lasting.facts(),
-            false => self.at_calls().facts(),
+            false => self.call_probes().facts(),
         }
     }
 }
@@ -118,12 +118,12 @@ pub(super) fn follow(shared: &Shared, work: Work) {
     while !shared.stop.load(Ordering::Acquire) {
         shared.progress.step();
         if observation.is_resting && !shared.is_wanted() {
-            observation.rest(shared);
+            observation.wait_idle(shared);
         } else {
-            observation.look(shared);
+            observation.run_round(shared);
         }
     }
-    shared.progress.rest();
+    shared.progress.set_idle();
 }
 
 /// State of the thread.
@@ -147,7 +147,7 @@ struct Observation {
     last_round: Instant,
     last_review: Instant,
     /// Whether the broker did not answer the last request: it may start later than this process.
-    lacks_broker: bool,
+    is_broker_unavailable: bool,
 }
 
 impl Observation {
@@ -168,13 +168,13 @@ impl Observation {
             rounds: 0,
             last_round: now,
             last_review: now,
-            lacks_broker: false,
+            is_broker_unavailable: false,
         }
     }
 
     /// Attaches to libraries in use, and reads the tables. Then waits for the next round, or
     /// becomes idle.
-    fn look(&mut self, shared: &Shared) {
+    fn run_round(&mut self, shared: &Shared) {
         let now = Instant::now();
         if std::mem::take(&mut self.is_resting) {
             self.last_round = now;
@@ -194,10 +194,10 @@ impl Observation {
         (self.late).follow(!ends && self.has_callbacks, &demand, &mut self.tables);
         let clocks = self.set_clocks();
         if !shared.is_late() {
-            self.round(shared, &clocks, ends);
+            self.read_round(shared, &clocks, ends);
         }
         if ends {
-            self.begin_rest(shared, failed);
+            self.become_idle(shared, failed);
             return;
         }
         self.rounds = self.rounds.saturating_add(1);
@@ -224,14 +224,14 @@ impl Observation {
             self.probes.install(now, broker);
         }
         self.probes.follow(&self.processes, to_calls, now, broker);
-        self.lacks_broker = failed.is_some();
+        self.is_broker_unavailable = failed.is_some();
         failed
     }
 
-    fn round(&mut self, shared: &Shared, clocks: &Clocks, is_last: bool) {
+    fn read_round(&mut self, shared: &Shared, clocks: &Clocks, is_last: bool) {
         let elapsed = self.last_round.elapsed();
         self.last_round += elapsed;
-        let showing = self.showing_intra_process();
+        let showing = self.processes_showing_intra_process();
         let (tables, broker) = (&mut self.tables, &mut self.broker);
         let is_showing = |process| showing.contains(&process);
         let late = &self.late;
@@ -240,7 +240,7 @@ impl Observation {
         self.late.set_bounds(&self.table, &mut self.tables);
         round.is_last = is_last;
         let hits = round.hits;
-        shared.put(round);
+        shared.store_round(round);
         if self.suspended_at.is_none() && !is_last && hits > MAX_HITS {
             tracing::warn!(
                 calls_per_second = hits,
@@ -252,7 +252,7 @@ impl Observation {
     }
 
     /// Becomes idle: forgets the calls so far, so that later calls are counted from zero.
-    fn begin_rest(&mut self, shared: &Shared, failed: Option<String>) {
+    fn become_idle(&mut self, shared: &Shared, failed: Option<String>) {
         if let Err(error) = self.tables.forget_calls() {
             let reason = in_words(&error);
             tracing::warn!(
@@ -261,7 +261,7 @@ impl Observation {
             );
         }
         self.table.forget_reports();
-        self.broker.rest();
+        self.broker.disconnect();
         self.is_resting = true;
         self.rounds = 0;
         self.last_review = Instant::now();
@@ -270,9 +270,9 @@ impl Observation {
 
     /// Waits at most one round for a client to need calls, and reads announcements of new
     /// processes.
-    fn rest(&mut self, shared: &Shared) {
+    fn wait_idle(&mut self, shared: &Shared) {
         let now = Instant::now();
-        let interval = match self.lacks_broker {
+        let interval = match self.is_broker_unavailable {
             true => RETRY_DELAY,
             false if self.table.len() >= MANY_PROCESSES => SHORT_REVIEW_INTERVAL,
             false => REVIEW_INTERVAL,
@@ -287,7 +287,7 @@ impl Observation {
         self.wait(shared, now + REPORT_INTERVAL);
         self.set_clocks();
         (self.table).drain(&mut self.tables, &Clocks::read(), &mut self.broker);
-        self.broker.rest();
+        self.broker.disconnect();
     }
 
     /// Waits until `end`, or until the demand changes. Reads announcements during the wait, because
@@ -301,9 +301,9 @@ impl Observation {
                     (self.table).drain(&mut self.tables, &Clocks::read(), &mut self.broker);
                     gathers_until = Instant::now() + ANNOUNCEMENT_DELAY;
                 }
-                Event::Mapped => self.meet_mapped(),
+                Event::Mapped => self.attach_mapped(),
                 Event::Demanded => {
-                    shared.bell.iter().for_each(Bell::silence);
+                    shared.bell.iter().for_each(Bell::drain);
                     return;
                 }
             }
@@ -311,7 +311,7 @@ impl Observation {
     }
 
     /// Attaches probes to a library that a process has just mapped.
-    fn meet_mapped(&mut self) {
+    fn attach_mapped(&mut self) {
         let new = self.take_mapped();
         if !new.is_incomplete && new.processes.is_empty() {
             std::thread::sleep(UNRELATED_DELAY);
@@ -364,8 +364,8 @@ impl Observation {
     }
 
     /// Returns the processes whose library reports every step of messages within them.
-    fn showing_intra_process(&self) -> HashSet<u32> {
-        let at_calls = self.probes.at_calls();
+    fn processes_showing_intra_process(&self) -> HashSet<u32> {
+        let at_calls = self.probes.call_probes();
         let attached = |id| at_calls.probe(id)?.as_ref().ok();
         let shows = |id| attached(id).is_some_and(|attached| attached.shows_intra_process);
         let using = self.processes.using();
@@ -396,7 +396,7 @@ impl Observation {
             has_inspected: true,
             libraries: self.probes.facts(self.is_resting),
             detached,
-            is_resting: self.is_resting,
+            is_idle: self.is_resting,
             shows_rates: self.rounds >= RATE_ROUNDS,
             late: self.late.observed(),
             without_events: self.late.without_events().map(str::to_owned),

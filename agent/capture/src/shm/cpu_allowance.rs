@@ -29,7 +29,7 @@ impl Default for CpuAllowance {
 
 impl CpuAllowance {
     /// Returns whether CPU time is left at `now`, in nanoseconds of the monotonic clock.
-    pub fn is_left(&mut self, now: u64) -> bool {
+    pub fn has_time_left(&mut self, now: u64) -> bool {
         let gained = now.saturating_sub(self.at) / SHARE_DIVISOR;
         if gained > 0 {
             self.at = now;
@@ -52,11 +52,11 @@ mod tests {
     use ros2probe_wire::time::SECOND;
 
     #[test]
-    fn constant_listing_costs_no_more_than_its_share() {
+    fn constant_listing_uses_no_more_cpu_than_its_share() {
         for cost in [1_000, 3_000_000, 700_000_000] {
             let (mut allowance, mut now, mut spent) = (CpuAllowance::default(), SECOND, 0);
             while now < 101 * SECOND {
-                if allowance.is_left(now) {
+                if allowance.has_time_left(now) {
                     allowance.spend(cost);
                     spent += cost;
                 }

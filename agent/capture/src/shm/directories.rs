@@ -182,15 +182,15 @@ impl ShmDirectories {
     /// rounds.
     pub fn find_new(&mut self) {
         self.newest.look();
-        if self.newest.lists || self.is_mounting || matches!(self.scope, Scope::Directories(_)) {
-            self.go_through_scope();
+        if self.newest.must_list || self.is_mounting || matches!(self.scope, Scope::Directories(_)) {
+            self.inspect_scope();
         }
     }
 
     /// Finds the directories of shared memory, and forgets those that no living process reaches.
     pub fn find(&mut self) {
         self.newest.look();
-        self.go_through_scope();
+        self.inspect_scope();
     }
 
     /// Returns whether each directory's path still reaches it. A path may lead through a process
@@ -201,19 +201,19 @@ impl ShmDirectories {
         directories.all(|directory| directory.path.exists())
     }
 
-    fn go_through_scope(&mut self) {
+    fn inspect_scope(&mut self) {
         for directory in self.directories.values_mut() {
             directory.seen = false;
         }
         match self.scope.clone() {
             Scope::Directories(directories) => {
                 for directory in directories {
-                    self.reach(&directory);
+                    self.find_directory(&directory);
                 }
             }
             Scope::Cgroup(_) => self.go_through_processes(),
             Scope::AllProcesses | Scope::Networks(_) => {
-                self.reach(Path::new(SHARED_MEMORY));
+                self.find_directory(Path::new(SHARED_MEMORY));
                 self.go_through_processes();
             }
         }
@@ -231,7 +231,7 @@ impl ShmDirectories {
 
     /// Inspects the processes in scope. They are listed again if there may be new ones.
     fn go_through_processes(&mut self) {
-        if self.newest.lists {
+        if self.newest.must_list {
             self.listed = self.scope.processes();
             // The agent itself may be in a cgroup in scope, but has no shared memory.
             if matches!(self.scope, Scope::Cgroup(_)) {
@@ -239,11 +239,11 @@ impl ShmDirectories {
             }
         }
         let processes = std::mem::take(&mut self.listed);
-        self.go_through(&processes);
+        self.inspect_processes(&processes);
         self.listed = processes;
     }
 
-    fn go_through(&mut self, processes: &[u32]) {
+    fn inspect_processes(&mut self, processes: &[u32]) {
         let before = std::mem::take(&mut self.processes);
         self.is_mounting = false;
         for &pid in processes {
@@ -276,10 +276,10 @@ impl ShmDirectories {
         let devices = PathBuf::from(format!("/proc/{pid}/root/dev"));
         let within = devices.join("shm");
         let is_plain = is_directory(&devices) && is_directory(&within);
-        is_plain.then(|| self.reach(&within)).flatten()
+        is_plain.then(|| self.find_directory(&within)).flatten()
     }
 
-    fn reach(&mut self, path: &Path) -> Option<ShmDirectoryId> {
+    fn find_directory(&mut self, path: &Path) -> Option<ShmDirectoryId> {
         let metadata = fs::metadata(path).ok().filter(Metadata::is_dir)?;
         let id = ShmDirectoryId {
             device: metadata.dev(),
@@ -333,11 +333,11 @@ impl ShmDirectory {
         }
         if entries.next().is_some() {
             *left_out += 1;
-            files = self.keep(files, known);
+            files = self.keep_existing(files, known);
         }
         *left_out += files.len().saturating_sub(DirectoryFiles::CAP) as u64;
         if files.len() > DirectoryFiles::CAP {
-            files = self.choose(files, &locks);
+            files = self.select_files(files, &locks);
         }
         self.files = files.into_iter().collect();
         true
@@ -345,7 +345,7 @@ impl ShmDirectory {
 
     /// For a partially listed directory, returns the `listed` files and the `known` files that
     /// still exist.
-    fn keep(&self, listed: Vec<(Name, u64)>, known: HashMap<Name, u64>) -> Vec<(Name, u64)> {
+    fn keep_existing(&self, listed: Vec<(Name, u64)>, known: HashMap<Name, u64>) -> Vec<(Name, u64)> {
         let mut files: HashMap<Name, u64> = listed.into_iter().collect();
         for (name, inode) in known {
             let metadata = || fs::symlink_metadata(self.path.join(name.file_name()));
@@ -359,7 +359,7 @@ impl ShmDirectory {
 
     /// Selects from too many files: first files of living processes, then an equal number per user,
     /// oldest first. No user can hide another's files in this way.
-    fn choose(&self, files: Vec<(Name, u64)>, locks: &[(Name, u64)]) -> Vec<(Name, u64)> {
+    fn select_files(&self, files: Vec<(Name, u64)>, locks: &[(Name, u64)]) -> Vec<(Name, u64)> {
         let device = fs::metadata(&self.path).map_or(0, |metadata| metadata.dev());
         let held = Locks::read();
         let locks = locks.iter();
@@ -369,14 +369,14 @@ impl ShmDirectory {
             .into_iter()
             .partition::<Vec<_>, _>(|(name, _)| alive.contains(name));
         if chosen.len() > DirectoryFiles::CAP {
-            return self.share(chosen, DirectoryFiles::CAP);
+            return self.share_among_users(chosen, DirectoryFiles::CAP);
         }
-        chosen.extend(self.share(others, DirectoryFiles::CAP - chosen.len()));
+        chosen.extend(self.share_among_users(others, DirectoryFiles::CAP - chosen.len()));
         chosen
     }
 
     /// Selects this many files, an equal number per user.
-    fn share(&self, files: Vec<(Name, u64)>, room: usize) -> Vec<(Name, u64)> {
+    fn share_among_users(&self, files: Vec<(Name, u64)>, room: usize) -> Vec<(Name, u64)> {
         let files = files.into_iter().filter_map(|(name, inode)| {
             let metadata = fs::symlink_metadata(self.path.join(name.file_name())).ok()?;
             let age = (metadata.ctime(), metadata.ctime_nsec());
@@ -404,10 +404,10 @@ struct NewestProcess {
     file: Option<File>,
     id: Option<u32>,
     /// Whether the next round lists the processes.
-    lists: bool,
+    must_list: bool,
     /// Number of rounds since the newest process changed, and since the processes were listed.
     rounds: u32,
-    same: u32,
+    rounds_since_list: u32,
 }
 
 impl NewestProcess {
@@ -429,10 +429,10 @@ impl NewestProcess {
         } else {
             self.rounds.saturating_add(1)
         };
-        self.same += 1;
-        self.lists = self.rounds <= MOVING_ROUNDS || self.same >= MAX_REUSED_ROUNDS;
-        if self.lists {
-            self.same = 0;
+        self.rounds_since_list += 1;
+        self.must_list = self.rounds <= MOVING_ROUNDS || self.rounds_since_list >= MAX_REUSED_ROUNDS;
+        if self.must_list {
+            self.rounds_since_list = 0;
         }
     }
 }
@@ -483,7 +483,7 @@ mod tests {
         let mut lists = |id, rounds: u32| {
             let rounds = (0..rounds).filter(|_| {
                 newest.note(id);
-                newest.lists
+                newest.must_list
             });
             rounds.count()
         };

@@ -16,7 +16,7 @@ const FILE_BLOCK_BYTES: u64 = 512;
 
 /// Inode of a network namespace, and a domain. Participants of Fast DDS that have both in common use
 /// shared memory with each other.
-type Meeting = (u64, u32);
+type SharingGroup = (u64, u32);
 
 impl ShmDirectories {
     /// Returns the use of the directories. Network namespaces of processes that this process may not
@@ -25,7 +25,7 @@ impl ShmDirectories {
     pub fn memory_use(&self) -> MemoryUse {
         let locks = Locks::read();
         let mut memory = MemoryUse::default();
-        let mut meetings: BTreeMap<Meeting, u64> = BTreeMap::new();
+        let mut meetings: BTreeMap<SharingGroup, u64> = BTreeMap::new();
         for directory in self.directories.values() {
             let (stale, of_directory) = directory.owners(&locks);
             memory.stale_bytes += stale;
@@ -48,7 +48,7 @@ impl ShmDirectories {
 
 impl ShmDirectory {
     /// Returns the bytes of files of ended processes, and where living processes with ports meet.
-    fn owners(&self, locks: &Locks) -> (u64, BTreeSet<Meeting>) {
+    fn owners(&self, locks: &Locks) -> (u64, BTreeSet<SharingGroup>) {
         let (mut stale, mut meetings) = (0, BTreeSet::new());
         for name in self.files.keys() {
             let path = self.path.join(name.file_name());

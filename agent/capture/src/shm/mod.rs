@@ -41,7 +41,7 @@ use self::tap::{Counters, Tap};
 use super::border::observe;
 use super::container::{is_container, is_service};
 use super::reorder_buffer::ReorderBuffer;
-use super::system::{Clocks, DirectoryWatch, calendar, monotonic, run_first, thread_cpu, wait};
+use super::system::{Clocks, DirectoryWatch, wall_clock_nanoseconds, monotonic, run_first, thread_cpu, wait};
 use crate::threads::{Progress, Spawn, Task};
 use ros2probe_model::observe::input::Input;
 use ros2probe_model::observe::observer::{Observer, Wanted};
@@ -70,7 +70,7 @@ pub struct Facts {
     /// CPU time of the tap's thread, in seconds.
     pub cpu_seconds: f64,
     /// Number of polls.
-    pub looks: u64,
+    pub polls: u64,
     /// Factor by which sleeps are extended to stay within the CPU share.
     pub stretch: f64,
     /// Items lost because the queue was full.
@@ -164,7 +164,7 @@ impl SharedMemory {
                     };
                     let at = clocks.monotonic_of(time);
                     let record = match &mut order {
-                        Some(order) => order.polled(at, record),
+                        Some(order) => order.add_polled(at, record),
                         None => Some(record),
                     };
                     if let Some(record) = record {
@@ -243,7 +243,7 @@ impl Shared {
         *facts.unwrap_or_else(PoisonError::into_inner) = Facts {
             counters: tap.counters(),
             cpu_seconds: seconds(thread_cpu()),
-            looks,
+            polls: looks,
             stretch,
             refused: 0,
         };
@@ -270,9 +270,9 @@ fn poll(
     remedy: Option<&str>,
     ended: &PipeReader,
 ) {
-    let mut tap = Tap::new(directories, calendar);
+    let mut tap = Tap::new(directories, wall_clock_nanoseconds);
     let cpus = std::thread::available_parallelism().map_or(1, usize::from);
-    let mut interval = PollInterval::new(budget).on(cpus);
+    let mut interval = PollInterval::new(budget).with_cpus(cpus);
     // Without inotify, a new file is noticed at the next listing.
     let mut watch = DirectoryWatch::new().ok();
     let mut watched: HashMap<ShmDirectoryId, PathBuf> = HashMap::new();
@@ -292,16 +292,16 @@ fn poll(
             tap.close_all();
             reported = 0;
             shared.report(&tap, looks, interval.stretch());
-            shared.progress.rest();
+            shared.progress.set_idle();
             std::thread::sleep(PAUSE_SLEEP);
             continue;
         }
         let now = monotonic();
         let at = seconds(now);
         let announced = tap.poll(now, &mut found);
-        shared.inbox.put(&mut found);
+        shared.inbox.add_all(&mut found);
         looks += 1;
-        if looks % ACCOUNT_INTERVAL == 0 || !(tap.is_hurried || tap.misses_nothing) {
+        if looks % ACCOUNT_INTERVAL == 0 || !(tap.is_urgent || tap.needs_every_message) {
             cpu = seconds(thread_cpu());
         }
         if now.saturating_sub(reported) >= REPORT_INTERVAL {
@@ -318,12 +318,12 @@ fn poll(
             Need::Nothing
         };
         if tap.take_discovery_seen() {
-            interval.announcement(at);
+            interval.announcement_read(at);
         }
         let sleep = interval.sleep(at, cpu, announced, need);
-        tap.is_hurried = interval.is_watching_closely(at);
-        tap.misses_nothing = need == Need::Every;
-        if may_be_first && (tap.is_hurried || tap.misses_nothing) != is_first {
+        tap.is_urgent = interval.is_polling_closely(at);
+        tap.needs_every_message = need == Need::Every;
+        if may_be_first && (tap.is_urgent || tap.needs_every_message) != is_first {
             is_first = !is_first;
             if let Err(error) = run_first(is_first) {
                 (may_be_first, is_first) = (false, false);
@@ -335,7 +335,7 @@ fn poll(
         }
         // While listing has used up its CPU share, events about new files wait as well.
         let Some(watch) = watch.as_mut().filter(|_| tap.may_list(now)) else {
-            shared.progress.rest();
+            shared.progress.set_idle();
             std::thread::sleep(sleep);
             continue;
         };
@@ -343,7 +343,7 @@ fn poll(
             && tap
                 .directories()
                 .all(|(id, path)| watched.get(&id).is_some_and(|known| known == path));
-        let idle = tap.idle(now).filter(|_| is_same && watches_all);
+        let idle = tap.until_next_search(now).filter(|_| is_same && watches_all);
         if !is_same {
             // A file may have appeared just before: the next listing follows soon.
             let paths = tap.directories();
@@ -355,16 +355,16 @@ fn poll(
         // The creation of a file ends the sleep, so an idle tap may sleep longer.
         let sleep = idle.map_or(sleep, |idle| sleep.max(Duration::from_nanos(idle)));
         let before = thread_cpu();
-        shared.progress.rest();
+        shared.progress.set_idle();
         let ready = wait(&[watch.as_fd(), ended.as_fd()], sleep);
         shared.progress.step();
         if matches!(ready, Ok(Some(0))) && watch.created(|name| Name::parse(name).is_some()) {
             tap.spend(thread_cpu().saturating_sub(before));
             tap.expect_participant();
-            interval.newcomer(at);
+            interval.participant_starting(at);
         }
     }
-    shared.progress.rest();
+    shared.progress.set_idle();
 }
 
 #[expect(

@@ -84,11 +84,11 @@ pub struct PollInterval {
     stretch: f64,
     quiet_since: f64,
     accounted: (f64, f64),
-    meeting_until: f64,
-    awake_until: f64,
+    close_until: f64,
+    busy_until: f64,
     /// Whether the machine has another CPU for other processes during busy polling.
-    has_company: bool,
-    was_close: bool,
+    has_spare_cpu: bool,
+    was_polling_closely: bool,
     /// CPU time left for close polling.
     credit: f64,
     /// Remaining budget while every message is needed, with the time and the CPU time at which it
@@ -108,10 +108,10 @@ impl PollInterval {
             stretch: 1.0,
             quiet_since: 0.0,
             accounted: (0.0, 0.0),
-            meeting_until: 0.0,
-            awake_until: 0.0,
-            has_company: false,
-            was_close: false,
+            close_until: 0.0,
+            busy_until: 0.0,
+            has_spare_cpu: false,
+            was_polling_closely: false,
             credit: MAX_CREDIT,
             savings: MAX_SAVINGS,
             spent: (0.0, 0.0),
@@ -120,30 +120,30 @@ impl PollInterval {
 
     /// Sets whether busy polling is allowed, which needs more than one CPU.
     #[must_use]
-    pub const fn on(self, cpus: usize) -> Self {
+    pub const fn with_cpus(self, cpus: usize) -> Self {
         Self {
-            has_company: cpus > 1,
+            has_spare_cpu: cpus > 1,
             ..self
         }
     }
 
     /// Starts close polling for a moment, within the credit, because a participant is starting.
-    pub fn newcomer(&mut self, now: f64) {
-        self.watch_closely(now + PARTICIPANT_WATCH);
+    pub fn participant_starting(&mut self, now: f64) {
+        self.poll_closely_until(now + PARTICIPANT_WATCH);
     }
 
     /// Extends close polling, because an announcement was read and more may follow.
-    pub fn announcement(&mut self, now: f64) {
-        self.watch_closely(now + ANNOUNCEMENT_WATCH);
-        if self.has_company && self.credit > MAX_CREDIT / 2.0 {
-            self.awake_until = now + BUSY_POLL_TIME;
+    pub fn announcement_read(&mut self, now: f64) {
+        self.poll_closely_until(now + ANNOUNCEMENT_WATCH);
+        if self.has_spare_cpu && self.credit > MAX_CREDIT / 2.0 {
+            self.busy_until = now + BUSY_POLL_TIME;
         }
     }
 
     /// Returns whether the tap polls closely because a participant is starting.
     #[must_use]
-    pub fn is_watching_closely(&self, now: f64) -> bool {
-        now < self.meeting_until
+    pub fn is_polling_closely(&self, now: f64) -> bool {
+        now < self.close_until
     }
 
     /// Returns how long to sleep after a poll at `now` that found this many messages; `cpu` is the
@@ -152,13 +152,13 @@ impl PollInterval {
         if found > 0 {
             self.quiet_since = now;
         }
-        if self.was_close {
+        if self.was_polling_closely {
             let (_, used) = std::mem::replace(&mut self.accounted, (now, cpu));
             self.credit -= cpu - used;
         }
-        self.was_close = self.is_watching_closely(now) && self.credit > 0.0;
-        if self.was_close {
-            if now < self.awake_until {
+        self.was_polling_closely = self.is_polling_closely(now) && self.credit > 0.0;
+        if self.was_polling_closely {
+            if now < self.busy_until {
                 return Duration::ZERO;
             }
             // The start of a whole robot uses up the credit slowly. A robot repeats its names: each
@@ -167,7 +167,7 @@ impl PollInterval {
             self.sleep = (MEETING_SLEEP / rest.powi(4)).min(DISCOVERY_LIMIT_SLEEP);
             return Duration::from_secs_f64(self.sleep);
         }
-        self.meeting_until = now;
+        self.close_until = now;
         if (need == Need::Every) != (self.need == Need::Every) {
             // The budget changes, so the measured cost is forgotten.
             (self.stretch, self.accounted) = (1.0, (now, cpu));
@@ -176,9 +176,9 @@ impl PollInterval {
             self.spent = (now, cpu);
         }
         self.need = need;
-        self.account(now, cpu);
+        self.account_cpu(now, cpu);
         if need == Need::Every {
-            return self.sleep_little(now, cpu, found);
+            return self.short_sleep(now, cpu, found);
         }
         let longest = match need {
             Need::Nothing => UNNEEDED_SLEEP,
@@ -204,32 +204,32 @@ impl PollInterval {
     /// Returns the sleep while every message is needed: shorter for a moment after each message,
     /// which may start a burst. The sleep is never 0, because the thread preempts the processes
     /// whose messages it reads.
-    fn sleep_little(&mut self, now: f64, cpu: f64, found: usize) -> Duration {
+    fn short_sleep(&mut self, now: f64, cpu: f64, found: usize) -> Duration {
         let (then, used) = std::mem::replace(&mut self.spent, (now, cpu));
         let saved = (now - then) * self.budget.every - (cpu - used);
         self.savings = (self.savings + saved).clamp(-MAX_OVERDRAFT, MAX_SAVINGS);
         self.sleep = EVERY_MESSAGE_SLEEP;
         if found > 0 {
-            self.awake_until = now + BUSY_POLL_TIME;
+            self.busy_until = now + BUSY_POLL_TIME;
         }
         if self.savings <= 0.0 {
             let slower = EVERY_MESSAGE_SLEEP * self.stretch.max(SLEEP_GROWTH);
             return Duration::from_secs_f64(slower.min(MAX_SLEEP));
         }
-        Duration::from_secs_f64(if now < self.awake_until {
+        Duration::from_secs_f64(if now < self.busy_until {
             EARLY_WAKE
         } else {
             EVERY_MESSAGE_SLEEP
         })
     }
 
-    fn watch_closely(&mut self, until: f64) {
+    fn poll_closely_until(&mut self, until: f64) {
         if self.credit > 0.0 {
-            self.meeting_until = self.meeting_until.max(until);
+            self.close_until = self.close_until.max(until);
         }
     }
 
-    fn account(&mut self, now: f64, cpu: f64) {
+    fn account_cpu(&mut self, now: f64, cpu: f64) {
         let (then, used) = self.accounted;
         let elapsed = now - then;
         if elapsed < ACCOUNT_INTERVAL {
@@ -322,7 +322,7 @@ mod tests {
     #[test]
     fn a_new_participant_causes_close_polling_for_a_limited_time() {
         let mut interval = PollInterval::new(BUDGET);
-        interval.newcomer(100.0);
+        interval.participant_starting(100.0);
         let microseconds = |interval: &mut PollInterval, now, cpu| {
             interval.sleep(now, cpu, 0, Need::Nothing).as_micros()
         };
@@ -332,9 +332,9 @@ mod tests {
         // Participants start constantly, and close polls take a third of a CPU.
         let (mut now, mut cpu) = (101.0, 0.0);
         while now < 201.0 {
-            interval.newcomer(now);
+            interval.participant_starting(now);
             microseconds(&mut interval, now, cpu);
-            let close = interval.was_close;
+            let close = interval.was_polling_closely;
             now += 0.01;
             cpu += if close { 0.003 } else { 0.0 };
         }
@@ -345,12 +345,12 @@ mod tests {
     #[test]
     fn the_start_of_a_robot_is_polled_closely_within_the_credit() {
         for cost in [8e-6, 25e-6] {
-            let mut interval = PollInterval::new(BUDGET).on(2);
+            let mut interval = PollInterval::new(BUDGET).with_cpus(2);
             let (mut now, mut cpu, mut polls, mut longest) = (100.0, 0.0, 0_u32, Duration::ZERO);
             // The nodes of the robot start within 6 s, and user data flows.
             while now < 160.0 {
                 if now < 106.0 {
-                    interval.newcomer(now);
+                    interval.participant_starting(now);
                 }
                 let is_starting = now < 106.0;
                 let slept = interval.sleep(now, cpu, usize::from(polls % 4 == 0), Need::Watching);
@@ -372,11 +372,11 @@ mod tests {
     #[test]
     fn an_announcement_causes_busy_polling_if_other_processes_have_a_cpu() {
         for cpus in [1, 2] {
-            let mut interval = PollInterval::new(BUDGET).on(cpus);
-            interval.newcomer(100.0);
+            let mut interval = PollInterval::new(BUDGET).with_cpus(cpus);
+            interval.participant_starting(100.0);
             let mut microseconds = |now, is_announced, cpu| {
                 if is_announced {
-                    interval.announcement(now);
+                    interval.announcement_read(now);
                 }
                 interval.sleep(now, cpu, 1, Need::Names).as_micros()
             };
@@ -395,12 +395,12 @@ mod tests {
     #[test]
     fn polling_for_every_message_runs_every_50_us_within_its_own_budget() {
         let idle = |_: f64| 0;
-        let mut interval = PollInterval::new(BUDGET).on(2);
+        let mut interval = PollInterval::new(BUDGET).with_cpus(2);
         let (share, looks) = run(&mut interval, 10.0, 8e-6, Need::Every, idle);
         assert!(looks > 15_000.0 && share < 0.16, "{looks} {share}");
         // The load is a hundred thousand messages per second, with cheap and with expensive polls.
         for cost in [8e-6, 60e-6] {
-            let mut interval = PollInterval::new(BUDGET).on(2);
+            let mut interval = PollInterval::new(BUDGET).with_cpus(2);
             (interval.need, interval.savings) = (Need::Every, 0.0);
             let (share, looks) = run(&mut interval, 20.0, cost, Need::Every, |_| 10);
             assert!(share <= 0.27 && looks > 2000.0, "{cost} {share} {looks}");
@@ -412,7 +412,7 @@ mod tests {
 
     #[test]
     fn a_needed_message_causes_an_early_poll_within_the_budget() {
-        let mut interval = PollInterval::new(BUDGET).on(2);
+        let mut interval = PollInterval::new(BUDGET).with_cpus(2);
         let mut microseconds =
             |now, cpu, found| interval.sleep(now, cpu, found, Need::Every).as_micros();
         assert_eq!(microseconds(1.0, 0.0, 0), 50);

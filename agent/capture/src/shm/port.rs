@@ -44,8 +44,8 @@ pub struct Port {
     position: u32,
     shadow: Bounded<PortCells, Vec<Descriptor>>,
     unfilled_since: Option<u64>,
-    looked: u64,
-    pace: PeakRate,
+    last_polled: u64,
+    peak_rate: PeakRate,
     bytes: Vec<u8>,
 }
 
@@ -84,8 +84,8 @@ impl Port {
             position: 0,
             shadow: Bounded::default(),
             unfilled_since: None,
-            looked: now,
-            pace: PeakRate::default(),
+            last_polled: now,
+            peak_rate: PeakRate::default(),
             bytes: Vec::new(),
         };
         let mut before = port.write_position(source)?;
@@ -116,12 +116,12 @@ impl Port {
         now: u64,
         found: &mut Vec<Descriptor>,
     ) -> Option<PortPoll> {
-        let elapsed = now.saturating_sub(std::mem::replace(&mut self.looked, now));
+        let elapsed = now.saturating_sub(std::mem::replace(&mut self.last_polled, now));
         let write = self.write_position(source)?;
         let capacity = self.layout.capacity;
         let mut ahead = self.layout.distance(self.position, write);
         let mut look = PortPoll {
-            is_uncertain: self.pace.may_lap(elapsed, capacity),
+            is_uncertain: self.peak_rate.may_have_lapped(elapsed, capacity),
             ..PortPoll::default()
         };
         if ahead == 0 {
@@ -158,7 +158,7 @@ impl Port {
             look.pushed += 1;
             self.position = self.layout.advance(self.position, 1);
         }
-        self.pace.count(look.pushed, now);
+        self.peak_rate.count(look.pushed, now);
         Some(look)
     }
 
@@ -241,7 +241,7 @@ impl Layout {
 impl PeakRate {
     /// Returns whether the ring may have wrapped around twice at the recent rate, which looks like
     /// no message.
-    fn may_lap(&self, elapsed: u64, capacity: u32) -> bool {
+    fn may_have_lapped(&self, elapsed: u64, capacity: u32) -> bool {
         let pushed = u128::from(self.peak) * u128::from(elapsed) / 1_000_000_000;
         pushed >= 2 * u128::from(capacity)
     }

@@ -81,7 +81,7 @@ impl Buffer {
     /// far is valid.
     #[must_use]
     pub fn is_valid<S: Source + ?Sized>(&self, source: &S) -> bool {
-        let status = source.long(self.node);
+        let status = source.u64_at(self.node);
         status.is_some_and(|status| status & VALIDITY_MASK == u64::from(self.validity))
     }
 

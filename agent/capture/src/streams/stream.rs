@@ -8,8 +8,8 @@ use ros2probe_model::graph::zenoh::StreamEvent;
 use ros2probe_wire::rtps_tcp::{self, FrameHeader};
 use ros2probe_wire::{GuidPrefix, Timestamp};
 
-use super::search::{self, Looks, Search};
-use super::{Before, Chunk, Counters, Protocol};
+use super::search::{self, Assessment, Search};
+use super::{MissingBefore, Chunk, Counters, Protocol};
 use crate::tables::{SegmentsAhead, SegmentsAheadBytes};
 
 /// Maximum distance of a segment from the next expected byte: the largest TCP window.
@@ -30,7 +30,7 @@ const MAX_EMPTY: usize = 64;
 
 /// Result of taking a chunk.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub enum Took {
+pub enum TakeResult {
     /// The chunk was read, or waits for earlier bytes.
     Chunk,
     /// The connection appears to be one of another protocol.
@@ -91,7 +91,7 @@ struct Ahead {
     sequence_number: u32,
     length: u32,
     boundary: Option<Protocol>,
-    before: Before,
+    before: MissingBefore,
     bytes: Box<[u8]>,
 }
 
@@ -173,7 +173,7 @@ impl Stream {
     }
 
     /// Returns whether segments wait for missing ones.
-    pub fn waits(&self) -> bool {
+    pub fn is_waiting(&self) -> bool {
         !self.ahead.is_empty()
     }
 
@@ -188,20 +188,20 @@ impl Stream {
         chunk: &Chunk<'_>,
         counters: &mut Counters,
         report: &mut impl FnMut(Event<'_>),
-    ) -> Took {
+    ) -> TakeResult {
         let start = chunk.sequence_number.wrapping_add(u32::from(chunk.syn));
         if chunk.syn {
             report(Event::Zenoh(StreamEvent::Begin));
         }
         if matches!(self.position, Position::Other) && chunk.boundary.is_none() {
             self.next = start.wrapping_add(chunk.length);
-            return Took::Other;
+            return TakeResult::Other;
         }
         // Flags are about the bytes before a later byte.
         let is_old = start.wrapping_sub(self.next) >= MAX_SEGMENT_DISTANCE;
         match chunk.before {
             _ if is_old => {}
-            Before::Lost => self.lost(start, counters, report),
+            MissingBefore::Lost => self.lost(start, counters, report),
             before if self.ahead.is_empty() => self.skip(before, start, counters, report),
             _ => {}
         }
@@ -210,14 +210,14 @@ impl Stream {
             if self.ahead.is_empty() {
                 self.waiting_since = chunk.time;
             }
-            self.keep(start, chunk);
+            self.hold(start, chunk);
             let is_full = self.ahead.is_full() || self.ahead_bytes.is_exceeded();
             if is_full || self.has_waited(chunk.time) {
-                self.give_up(counters, report);
-            } else if chunk.before != Before::Unknown {
+                self.skip_missing(counters, report);
+            } else if chunk.before != MissingBefore::Unknown {
                 self.catch_up(counters, report);
             }
-            return Took::Chunk;
+            return TakeResult::Chunk;
         }
         let took = self.read(
             start,
@@ -227,14 +227,14 @@ impl Stream {
             counters,
             report,
         );
-        if took == Took::Chunk {
+        if took == TakeResult::Chunk {
             self.catch_up(counters, report);
         }
         took
     }
 
     /// Gives up the missing bytes and continues with the segments that wait.
-    pub fn give_up(&mut self, counters: &mut Counters, report: &mut impl FnMut(Event<'_>)) {
+    pub fn skip_missing(&mut self, counters: &mut Counters, report: &mut impl FnMut(Event<'_>)) {
         let Some(first) = self.ahead.front() else {
             return;
         };
@@ -273,21 +273,21 @@ impl Stream {
     /// Continues at a later byte, if whole batches before it were left out on purpose.
     fn skip(
         &mut self,
-        before: Before,
+        before: MissingBefore,
         start: u32,
         counters: &mut Counters,
         report: &mut impl FnMut(Event<'_>),
     ) {
-        if before == Before::OverBudget {
+        if before == MissingBefore::OverBudget {
             self.gap(counters, report);
         }
-        let is_left_out = matches!(before, Before::Skipped | Before::OverBudget);
+        let is_left_out = matches!(before, MissingBefore::Skipped | MissingBefore::OverBudget);
         if is_left_out && start.wrapping_sub(self.next) < MAX_SEGMENT_DISTANCE {
             self.next = start;
         }
     }
 
-    fn keep(&mut self, start: u32, chunk: &Chunk<'_>) {
+    fn hold(&mut self, start: u32, chunk: &Chunk<'_>) {
         let distance = start.wrapping_sub(self.next);
         let next = self.next;
         let position = self
@@ -332,11 +332,11 @@ impl Stream {
         boundary: Option<Protocol>,
         counters: &mut Counters,
         report: &mut impl FnMut(Event<'_>),
-    ) -> Took {
+    ) -> TakeResult {
         let repeated = self.next.wrapping_sub(start).min(length);
         counters.retransmitted_bytes += u64::from(repeated);
         if repeated == length {
-            return Took::Chunk;
+            return TakeResult::Chunk;
         }
         self.next = start.wrapping_add(length);
         let skipped = usize::try_from(repeated).unwrap_or(usize::MAX);
@@ -361,7 +361,7 @@ impl Stream {
         length: usize,
         counters: &mut Counters,
         report: &mut impl FnMut(Event<'_>),
-    ) -> Took {
+    ) -> TakeResult {
         match &mut self.position {
             Position::Batch(partial) => {
                 if !partial.read(bytes, length, counters, report) {
@@ -369,54 +369,54 @@ impl Stream {
                     self.position = Position::Searching(Search::default());
                     self.gap(counters, report);
                 }
-                Took::Chunk
+                TakeResult::Chunk
             }
             Position::Beginning(search) => {
                 match search.add(bytes, length, true, self.is_zenoh_port) {
-                    Looks::Zenoh(held) => {
-                        self.found(Protocol::Zenoh, &held, held.len(), counters, report);
+                    Assessment::Zenoh(held) => {
+                        self.read_found(Protocol::Zenoh, &held, held.len(), counters, report);
                     }
-                    Looks::Rtps(held) => {
-                        self.found(Protocol::Rtps, &held, held.len(), counters, report);
+                    Assessment::Rtps(held) => {
+                        self.read_found(Protocol::Rtps, &held, held.len(), counters, report);
                     }
-                    Looks::Undecided => {}
-                    Looks::Tls => {
+                    Assessment::Undecided => {}
+                    Assessment::Tls => {
                         self.position = Position::Other;
                         self.protocol = Some(Protocol::Zenoh);
-                        return Took::Tls;
+                        return TakeResult::Tls;
                     }
-                    Looks::Other => {
+                    Assessment::Other => {
                         self.position = Position::Other;
-                        return Took::Other;
+                        return TakeResult::Other;
                     }
                 }
-                Took::Chunk
+                TakeResult::Chunk
             }
             Position::Searching(search) => {
                 if let Some(at) = search::frame(bytes) {
                     let rest = bytes.get(at..).unwrap_or_default();
-                    self.found(Protocol::Rtps, rest, length - at, counters, report);
-                    return Took::Chunk;
+                    self.read_found(Protocol::Rtps, rest, length - at, counters, report);
+                    return TakeResult::Chunk;
                 }
                 if self.protocol == Some(Protocol::Rtps) {
-                    return Took::Chunk;
+                    return TakeResult::Chunk;
                 }
                 counters.unsynchronized_bytes += length as u64;
-                if let Looks::Zenoh(held) = search.add(bytes, length, false, self.is_zenoh_port) {
+                if let Assessment::Zenoh(held) = search.add(bytes, length, false, self.is_zenoh_port) {
                     let held_bytes = held.len();
                     counters.unsynchronized_bytes = counters
                         .unsynchronized_bytes
                         .saturating_sub(held_bytes as u64);
-                    self.found(Protocol::Zenoh, &held, held_bytes, counters, report);
+                    self.read_found(Protocol::Zenoh, &held, held_bytes, counters, report);
                 }
-                Took::Chunk
+                TakeResult::Chunk
             }
-            Position::Other => Took::Other,
+            Position::Other => TakeResult::Other,
         }
     }
 
     /// Reads `length` bytes, of which the first ones were captured. They begin with a batch or frame.
-    fn found(
+    fn read_found(
         &mut self,
         protocol: Protocol,
         bytes: &[u8],
@@ -482,7 +482,7 @@ impl Partial {
             (bytes, length) = (rest, length - count);
             match self.prefix() {
                 Prefix::Length(total) if self.arrived == total => {
-                    self.pass(total, counters, report);
+                    self.report_batch(total, counters, report);
                     if self.empty > MAX_EMPTY {
                         return false;
                     }
@@ -500,7 +500,7 @@ impl Partial {
     }
 
     /// Reports a complete batch or frame of `total` bytes.
-    fn pass(&mut self, total: usize, counters: &mut Counters, report: &mut impl FnMut(Event<'_>)) {
+    fn report_batch(&mut self, total: usize, counters: &mut Counters, report: &mut impl FnMut(Event<'_>)) {
         let length = total - self.prefix_len();
         let bytes = self.captured.get(self.prefix_len()..).unwrap_or_default();
         match self.protocol {

@@ -142,7 +142,7 @@ impl<P> Attachments<P> {
         }
         for (process, used) in processes.using() {
             for mapped in &used.libraries {
-                self.meet(mapped, process, now, broker);
+                self.attach_mapped(mapped, process, now, broker);
             }
         }
         self.libraries.retain(|_, library| {
@@ -155,7 +155,7 @@ impl<P> Attachments<P> {
         });
     }
 
-    fn meet(&mut self, mapped: &Mapped, process: u32, now: Instant, broker: &mut Broker) {
+    fn attach_mapped(&mut self, mapped: &Mapped, process: u32, now: Instant, broker: &mut Broker) {
         let Mapped { id, path, .. } = mapped;
         let is_known = self
             .libraries

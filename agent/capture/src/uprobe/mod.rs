@@ -65,7 +65,7 @@ pub enum UprobeError {
 /// Returns the capabilities that the broker needs, apart from those that load programs. They are
 /// for events of mapped files, and for reading mapped files of other users' processes. Perf events
 /// need the wider CAP_SYS_ADMIN on recent kernels.
-fn needed() -> [(CapabilitySet, &'static str); 2] {
+fn required_capabilities() -> [(CapabilitySet, &'static str); 2] {
     let events = match Means::of_this_kernel() {
         Means::Links => (CapabilitySet::PERFMON, "CAP_PERFMON"),
         Means::PerfEvents => (CapabilitySet::SYS_ADMIN, "CAP_SYS_ADMIN"),
@@ -76,8 +76,8 @@ fn needed() -> [(CapabilitySet, &'static str); 2] {
 /// Returns the capabilities that the broker can use: the required ones, and two for opening a
 /// mapped file that was replaced, or that only its user may read.
 #[must_use]
-pub fn useful() -> CapabilitySet {
-    let required: CapabilitySet = needed().iter().map(|(one, _)| *one).collect();
+pub fn usable_capabilities() -> CapabilitySet {
+    let required: CapabilitySet = required_capabilities().iter().map(|(one, _)| *one).collect();
     required | CapabilitySet::CHECKPOINT_RESTORE | CapabilitySet::DAC_READ_SEARCH
 }
 
@@ -95,13 +95,13 @@ pub(crate) fn broker(socket: &Path) -> Result<Broker, UprobeError> {
 
 /// Returns the names of required capabilities that `effective` lacks.
 #[must_use]
-pub fn lacking(effective: CapabilitySet) -> Vec<&'static str> {
+pub fn missing_capabilities(effective: CapabilitySet) -> Vec<&'static str> {
     // CAP_SYS_ADMIN includes CAP_PERFMON.
     let inherited = match effective.contains(CapabilitySet::SYS_ADMIN) {
         true => CapabilitySet::PERFMON,
         false => CapabilitySet::empty(),
     };
-    let needed = needed();
+    let needed = required_capabilities();
     let lacking = needed
         .iter()
         .filter(|(one, _)| !(effective | inherited).contains(*one));
@@ -111,7 +111,7 @@ pub fn lacking(effective: CapabilitySet) -> Vec<&'static str> {
 /// Returns the missing capabilities of the calling thread; empty if its capabilities cannot be
 /// read.
 pub(crate) fn missing() -> Vec<&'static str> {
-    capabilities(None).map_or_else(|_| Vec::new(), |sets| lacking(sets.effective))
+    capabilities(None).map_or_else(|_| Vec::new(), |sets| missing_capabilities(sets.effective))
 }
 
 /// The kernel programs and the thread that attaches them.

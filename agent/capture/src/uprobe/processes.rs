@@ -41,8 +41,8 @@ pub struct Processes {
 
 #[derive(Debug)]
 struct Process {
-    met: u32,
-    use_of_it: Use,
+    rounds: u32,
+    library_use: Use,
     /// Whether its maps cannot be read for lack of permission.
     is_closed: bool,
 }
@@ -83,8 +83,8 @@ impl Processes {
     #[cfg(test)]
     pub(super) fn of(process: u32, use_of_it: Use) -> Self {
         let known = Process {
-            met: 1,
-            use_of_it,
+            rounds: 1,
+            library_use: use_of_it,
             is_closed: false,
         };
         Self {
@@ -102,9 +102,9 @@ impl Processes {
         let in_scope = self.in_scope(broker)?;
         let is_asked = |pid: &u32| {
             self.known.get(pid).is_none_or(|known| {
-                known.met <= LOADING_ROUNDS
-                    || known.met % MAX_QUIET_ROUNDS == pid % MAX_QUIET_ROUNDS
-                    || all && !known.use_of_it.is_any()
+                known.rounds <= LOADING_ROUNDS
+                    || known.rounds % MAX_QUIET_ROUNDS == pid % MAX_QUIET_ROUNDS
+                    || all && !known.library_use.is_any()
             })
         };
         let asked: Vec<_> = in_scope.iter().copied().filter(is_asked).collect();
@@ -115,16 +115,16 @@ impl Processes {
         let closed: HashSet<_> = users.closed.into_iter().collect();
         for pid in in_scope {
             let known = before.remove(&pid);
-            let met = known.as_ref().map_or(0, |known| known.met);
+            let met = known.as_ref().map_or(0, |known| known.rounds);
             let mut process = match known {
                 Some(known) if !asked.contains(&pid) => known,
                 _ => Process {
-                    met,
-                    use_of_it: used.remove(&pid).map(Use::from).unwrap_or_default(),
+                    rounds: met,
+                    library_use: used.remove(&pid).map(Use::from).unwrap_or_default(),
                     is_closed: closed.contains(&pid),
                 },
             };
-            process.met = met.saturating_add(1);
+            process.rounds = met.saturating_add(1);
             self.known.insert(pid, process);
         }
         Ok(())
@@ -146,8 +146,8 @@ impl Processes {
         for (pid, used) in broker.users(self.library, &pids)?.used {
             let process = Process {
                 // The process may load further libraries.
-                met: 0,
-                use_of_it: used.into(),
+                rounds: 0,
+                library_use: used.into(),
                 is_closed: false,
             };
             self.known.insert(pid, process);
@@ -194,8 +194,8 @@ impl Processes {
     pub fn using(&self) -> impl Iterator<Item = (u32, &Use)> {
         self.known
             .iter()
-            .filter(|(_, process)| process.use_of_it.is_any())
-            .map(|(pid, process)| (*pid, &process.use_of_it))
+            .filter(|(_, process)| process.library_use.is_any())
+            .map(|(pid, process)| (*pid, &process.library_use))
     }
 
     /// Returns a process that cannot be inspected and may use Fast DDS, because it holds a lock of

@@ -71,7 +71,7 @@ struct Shared {
     /// Whether any probe may be attached.
     attached: AtomicBool,
     /// Whether all processes have been inspected since the probes were last requested.
-    visited: AtomicBool,
+    has_inspected_all: AtomicBool,
     /// Whether probes are attached only while processes start, and while every message is needed.
     on_demand: bool,
     progress: Arc<Progress>,
@@ -112,7 +112,7 @@ impl LibrarySearch {
         // A participant announces its names once, within a tenth of a second, so probes are
         // attached to installed libraries in advance.
         attachments.install(Library::FastDds, Instant::now(), &mut broker);
-        progress.rest();
+        progress.set_idle();
         let shared = Arc::new(Shared {
             facts: Mutex::default(),
             progress,
@@ -120,7 +120,7 @@ impl LibrarySearch {
             wanted: AtomicBool::new(!on_demand),
             bell: Bell::new().ok(),
             attached: AtomicBool::new(true),
-            visited: AtomicBool::default(),
+            has_inspected_all: AtomicBool::default(),
             on_demand,
             stop: AtomicBool::new(false),
         });
@@ -159,7 +159,7 @@ impl LibrarySearch {
         if !shared.on_demand || shared.wanted.swap(wanted, Ordering::AcqRel) == wanted {
             return;
         }
-        shared.visited.store(false, Ordering::Release);
+        shared.has_inspected_all.store(false, Ordering::Release);
         shared.ring();
     }
 
@@ -168,7 +168,7 @@ impl LibrarySearch {
     #[must_use]
     pub fn is_attaching(&self) -> bool {
         let shared = &self.shared;
-        shared.wanted.load(Ordering::Acquire) && !shared.visited.load(Ordering::Acquire)
+        shared.wanted.load(Ordering::Acquire) && !shared.has_inspected_all.load(Ordering::Acquire)
     }
 
     /// Returns whether any probe may be attached.
@@ -231,13 +231,13 @@ fn follow(shared: &Shared, attachments: Attachments<Attached>, scope: Scope, bro
                 // Polling of shared memory resumes before the probes are detached.
                 shared.report(Facts::resting());
                 std::thread::sleep(DETACH_OVERLAP);
-                followed.rest();
+                followed.detach_all();
                 shared.attached.store(false, Ordering::Release);
                 tracing::info!("no longer attached: no samples are read");
             }
             somebody_came = true;
             asked_all = None;
-            followed.wait_resting(shared);
+            followed.wait_idle(shared);
             continue;
         }
         shared.attached.store(true, Ordering::Release);
@@ -252,9 +252,9 @@ fn follow(shared: &Shared, attachments: Attachments<Attached>, scope: Scope, bro
             followed.find(true, now);
         }
         shared.report(followed.facts());
-        shared.visited.store(true, Ordering::Release);
+        shared.has_inspected_all.store(true, Ordering::Release);
         let Some(watch) = &mut watch else {
-            followed.wait_attaching(None, INSPECTION_INTERVAL, shared);
+            followed.wait_and_attach(None, INSPECTION_INTERVAL, shared);
             continue;
         };
         shared_memory.find();
@@ -267,11 +267,11 @@ fn follow(shared: &Shared, attachments: Attachments<Attached>, scope: Scope, bro
             watch.add(new);
         }
         watched = directories;
-        followed.wait_attaching(None, EVENT_DELAY, shared);
-        let is_created = followed.wait_attaching(Some(watch), INSPECTION_INTERVAL, shared);
+        followed.wait_and_attach(None, EVENT_DELAY, shared);
+        let is_created = followed.wait_and_attach(Some(watch), INSPECTION_INTERVAL, shared);
         somebody_came = is_created && watch.created(|name| Name::parse(name).is_some());
     }
-    shared.progress.rest();
+    shared.progress.set_idle();
 }
 
 /// The processes, and the libraries that they use.
@@ -321,20 +321,20 @@ impl Followed {
     }
 
     /// Detaches from all libraries, so that the broker may end.
-    fn rest(&mut self) {
+    fn detach_all(&mut self) {
         self.attachments.clear();
-        self.broker.rest();
+        self.broker.disconnect();
     }
 
     /// Waits until a process maps a library, or every message is needed.
-    fn wait_resting(&mut self, shared: &Shared) {
+    fn wait_idle(&mut self, shared: &Shared) {
         let bell = shared.bell.iter().map(Bell::descriptor);
         let mapped = self.mappings.iter().flat_map(MappingEvents::descriptors);
         let descriptors: Vec<_> = bell.chain(mapped).collect();
-        shared.progress.rest();
+        shared.progress.set_idle();
         let ready = wait(&descriptors, INSPECTION_INTERVAL);
         shared.progress.step();
-        shared.bell.iter().for_each(Bell::silence);
+        shared.bell.iter().for_each(Bell::drain);
         let new = self.take_mapped();
         if new.is_incomplete || self.processes.are_in_scope(&new.processes) {
             self.starting_until = Instant::now() + STARTUP_TIME;
@@ -354,7 +354,7 @@ impl Followed {
 
     /// Waits at most `limit` for a created file, and returns whether one was created. Attaches to
     /// libraries that processes map in that time.
-    fn wait_attaching(
+    fn wait_and_attach(
         &mut self,
         watch: Option<&DirectoryWatch>,
         limit: Duration,
@@ -369,7 +369,7 @@ impl Followed {
             let created = watch.map(AsFd::as_fd);
             let mapped = self.mappings.iter().flat_map(MappingEvents::descriptors);
             let descriptors: Vec<_> = created.into_iter().chain(mapped).collect();
-            shared.progress.rest();
+            shared.progress.set_idle();
             let ready = wait(&descriptors, rest);
             shared.progress.step();
             match ready {

@@ -359,7 +359,7 @@ fn the_period_and_the_wait_of_a_timer_are_read_by_either_steady_clock() {
 }
 
 #[test]
-fn messages_taken_without_rmw_take_count_for_their_subscription_and_not_as_timers() {
+fn messages_taken_without_rmw_take_count_as_subscription_calls() {
     for is_older in [true, false] {
         let mut robot = Robot::new(248, &[], true);
         if !is_older {

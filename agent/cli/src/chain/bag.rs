@@ -91,7 +91,7 @@ impl BagChains {
     /// known.
     #[must_use]
     pub fn chains(&self, from: Option<&str>, to: Option<&str>) -> Vec<Chain<'_>> {
-        let lead = |end| self.lead(end);
+        let lead = |end| self.representative(end);
         parts(self.facts.chains.iter(), from.map(lead), to.map(lead))
     }
 
@@ -103,7 +103,7 @@ impl BagChains {
 
     /// Returns topics that stand for others in the chains, because they are published together.
     #[must_use]
-    pub fn together(&self) -> Vec<SharedStamps> {
+    pub fn simultaneous_topics(&self) -> Vec<SharedStamps> {
         let mut all: Vec<SharedStamps> = Vec::new();
         for (topic, lead) in &self.facts.together {
             let known = all.iter_mut().find(|known| *known.topic == **lead);
@@ -135,7 +135,7 @@ impl BagChains {
 
     /// Returns the number of messages that were not used: their stamps are multiples of 100 µs.
     #[must_use]
-    pub const fn rounded(&self) -> u64 {
+    pub const fn rounded_messages(&self) -> u64 {
         self.facts.rounded
     }
 
@@ -146,7 +146,7 @@ impl BagChains {
     }
 
     /// Returns the topic that stands for this one in the chains.
-    fn lead<'a>(&'a self, name: &'a str) -> &'a str {
+    fn representative<'a>(&'a self, name: &'a str) -> &'a str {
         let mut together = self.facts.together.iter();
         let known = together.find(|(topic, _)| **topic == *name);
         known.map_or(name, |(_, lead)| lead)

@@ -97,11 +97,11 @@ fn summary(page: &mut String, run: &Run, conditions: &[Condition], seen: &Observ
         let _ = write!(page, "<dt>{name}</dt><dd>{}</dd>", escape(&*value));
     }
     page.push_str("</dl>\n");
-    if seen.left_out > 0 {
+    if seen.omitted > 0 {
         let _ = writeln!(
             page,
             "<p>{} names are left out: the report is full.</p>",
-            seen.left_out
+            seen.omitted
         );
     }
 }

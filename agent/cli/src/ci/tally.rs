@@ -77,7 +77,7 @@ mod tests {
     };
 
     #[test]
-    fn entries_count_between_the_time_to_settle_and_the_end_of_the_judged_part() {
+    fn entries_between_settling_and_shutdown_are_counted() {
         let mut tally = Tally::default();
         for second in 0..40 {
             tally.add(f64::from(second), 1, &RULES);

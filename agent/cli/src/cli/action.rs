@@ -11,7 +11,7 @@ use ros2probe_api::names::Names;
 use ros2probe_api::nodes::Named;
 
 use super::events::ActionEcho;
-use super::shared::{Graph, print_found, print_or_fail, print_text};
+use super::shared::{Graph, print_names, print_or_fail, print_text};
 
 /// `rp action VERB`.
 #[derive(Args, Debug)]
@@ -126,7 +126,7 @@ impl Find {
             let actions: Vec<_> = action::of_topics(&names.topics).collect();
             topic::find(&self.action_type, actions.iter().map(typed), count)
         };
-        print_found(&graph, self.count_actions, found)
+        print_names(&graph, self.count_actions, found)
     }
 }
 

@@ -152,9 +152,9 @@ fn answer(bag: &BagChains, chains: &[ros2probe_api::chains::Chain<'_>]) -> Resul
         "times": bag.times(),
         "messages": bag.messages,
         "chains": chains,
-        "published_together": shared(bag.together()),
+        "published_together": shared(bag.simultaneous_topics()),
         "unclear": shared(bag.unclear()),
-        "rounded_stamps": bag.rounded(),
+        "rounded_stamps": bag.rounded_messages(),
         "ignored_messages": bag.refused(),
         "faults": bag.faults,
     }))
@@ -163,7 +163,7 @@ fn answer(bag: &BagChains, chains: &[ros2probe_api::chains::Chain<'_>]) -> Resul
 /// Returns lines about what could not be read, and about topics that are in no chain.
 fn notes(bag: &BagChains) -> Vec<String> {
     let mut notes = bag.faults.clone();
-    for SharedStamps { topic, others } in bag.together() {
+    for SharedStamps { topic, others } in bag.simultaneous_topics() {
         let others = others.join(", ");
         notes.push(format!(
             "{topic} stands for {others}: less than 1 ms apart with one stamp"
@@ -175,10 +175,10 @@ fn notes(bag: &BagChains) -> Vec<String> {
             others.join(" and ")
         ));
     }
-    if bag.rounded() > 0 {
+    if bag.rounded_messages() > 0 {
         notes.push(format!(
             "{} messages have stamps that are multiples of 100 µs, which prove nothing in a bag",
-            bag.rounded()
+            bag.rounded_messages()
         ));
     }
     if bag.refused() > 0 {

@@ -80,7 +80,7 @@ impl Diag {
                 known.insert(key, status.level.clone().into_owned());
             }
             if is_first && printed == 0 {
-                eprintln!("rp: {}", self.nothing(&answer));
+                eprintln!("rp: {}", self.empty_reason(&answer));
                 names_of(&agent, domain_id)?;
             }
             if !self.follow {
@@ -92,7 +92,7 @@ impl Diag {
     }
 
     /// Returns why nothing is printed.
-    fn nothing(&self, answer: &Diagnostics<'_>) -> Cow<'static, str> {
+    fn empty_reason(&self, answer: &Diagnostics<'_>) -> Cow<'static, str> {
         if answer.statuses.is_empty() {
             "no diagnostics were seen: nodes send them only if something subscribes to /diagnostics"
                 .into()

@@ -81,7 +81,7 @@ impl Doctor {
             }
         } else {
             let configured = configured(self.config.as_deref())?;
-            examine(&HostState::read(), &configured, &reach(&self.target))
+            examine(&HostState::read(), &configured, &reach_agent(&self.target))
         };
         self.print(&report)?;
         if self.fix {
@@ -141,7 +141,7 @@ fn is_confirmed(output: &mut Output) -> Result<bool> {
 }
 
 /// Tries to reach the agent on this host.
-fn reach(target: &Target) -> Reach {
+fn reach_agent(target: &Target) -> Reach {
     let asked = Agent::reach(target).and_then(|agent| {
         let answers = Answers::ask(&agent, target.domain_id)?;
         Ok((answers, agent.place()))
@@ -149,7 +149,7 @@ fn reach(target: &Target) -> Reach {
     match asked {
         Ok((answers, place)) => Reach::Answered(Box::new(answers), place),
         Err(error @ ClientError::Denied { .. }) => Reach::Denied(error.to_string()),
-        Err(error) => Reach::Nobody(error.to_string()),
+        Err(error) => Reach::NoAnswer(error.to_string()),
     }
 }
 

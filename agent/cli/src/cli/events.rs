@@ -99,7 +99,7 @@ impl ServiceEcho {
 
 impl ActionEcho {
     pub(crate) fn ask(self) -> Result<ExitCode> {
-        let parts = chosen(self.interfaces.as_deref()).map_err(user_error)?;
+        let parts = selected_parts(self.interfaces.as_deref()).map_err(user_error)?;
         let name = full_name(&self.action_name).map_err(user_error)?;
         let domain_id = self.target.domain()?;
         if let Some(action_type) = &self.action_type {
@@ -125,7 +125,7 @@ impl ActionEcho {
 }
 
 /// Returns the parts that `--interfaces` selects. An unknown part fails with ros2cli's message.
-fn chosen(interfaces: Option<&str>) -> Result<Vec<(&'static str, &'static str)>, Refused> {
+fn selected_parts(interfaces: Option<&str>) -> Result<Vec<(&'static str, &'static str)>, Refused> {
     let Some(interfaces) = interfaces else {
         return Ok(ACTION_PARTS.to_vec());
     };
@@ -163,7 +163,7 @@ fn print(
         dialect: target.dialect(),
         csv: printing.csv,
         style: printing.style(),
-        shown: printing.shown(),
+        shown: printing.truncation(),
         ..echo::Options::default()
     });
     let names: Vec<_> = topics.iter().map(|(_, name)| name.clone()).collect();
@@ -199,11 +199,11 @@ mod tests {
 
     #[test]
     fn parts_of_an_action_are_chosen_by_name() {
-        assert_eq!(chosen(None).map(|parts| parts.len()), Ok(5));
-        let two = chosen(Some(" feedback_topic|STATUS_TOPIC | status_topic"));
+        assert_eq!(selected_parts(None).map(|parts| parts.len()), Ok(5));
+        let two = selected_parts(Some(" feedback_topic|STATUS_TOPIC | status_topic"));
         let two: Vec<_> = two.unwrap().into_iter().map(|(part, _)| part).collect();
         assert_eq!(two, ["FEEDBACK_TOPIC", "STATUS_TOPIC"]);
-        let refused = |text: &str| chosen(Some(text)).unwrap_err().0;
+        let refused = |text: &str| selected_parts(Some(text)).unwrap_err().0;
         assert_eq!(refused(""), "Input action interface name is empty.");
         assert_eq!(
             refused("x|STATUS_TOPIC"),

@@ -61,7 +61,7 @@ pub(crate) struct Printing {
 }
 
 impl Printing {
-    pub(crate) fn shown(&self) -> Truncation {
+    pub(crate) fn truncation(&self) -> Truncation {
         Truncation {
             truncate: (!self.full_length).then_some(self.truncate_length),
             no_arrays: self.no_arr,
@@ -223,13 +223,13 @@ impl<'a> Types<'a> {
         hash: Option<&str>,
     ) -> Result<Arc<MessageType>> {
         if self.library.find(name, hash).is_err() {
-            self.learn(topic);
+            self.offer_definition(topic);
         }
         self.find(name, hash)
     }
 
     /// Adds the agent's definition of a topic's type. The library returns it only for its hash.
-    fn learn(&self, topic: &str) {
+    fn offer_definition(&self, topic: &str) {
         let Some((agent, domain_id)) = self.agent else {
             return;
         };
@@ -268,7 +268,7 @@ impl<'a> Types<'a> {
         let hash = offered.and_then(|offered| offered.definition_hash());
         let mut found = self.library.find(&sample.message_type, hash);
         if found.is_err() {
-            self.learn(&sample.topic);
+            self.offer_definition(&sample.topic);
             found = self.library.find(&sample.message_type, hash);
         }
         let found = match found {
@@ -312,7 +312,7 @@ impl MessageFilter {
         })
     }
 
-    pub(crate) fn passes(&mut self, sample: &Sample, payload: &[u8]) -> Result<bool> {
+    pub(crate) fn is_passed(&mut self, sample: &Sample, payload: &[u8]) -> Result<bool> {
         let Some(message_type) = self.types.of(sample) else {
             return Ok(false);
         };

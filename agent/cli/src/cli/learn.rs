@@ -136,7 +136,7 @@ impl Session {
         let (query, domain_id) = (&self.query, self.domain_id);
         let path = format!("/samples?{query}&domain_id={domain_id}&queue_bytes={QUEUE_BYTES}");
         let mut lines = agent.stream(&path)?;
-        self.view_while(&mut lines, agent)?;
+        self.view_until_end(&mut lines, agent)?;
         let begin = Instant::now();
         let end = begin + Duration::from_secs(self.seconds.into());
         let mut due = begin + VIEW_INTERVAL;
@@ -144,10 +144,10 @@ impl Session {
         while !self.is_over(Instant::now() >= end) {
             let left = due.saturating_duration_since(Instant::now());
             if left.is_zero() {
-                self.view_while(&mut lines, agent)?;
+                self.view_until_end(&mut lines, agent)?;
                 due += VIEW_INTERVAL;
                 if !std::mem::replace(&mut is_explained, true) {
-                    self.explain_unseen();
+                    self.print_unseen_reason();
                 }
                 continue;
             }
@@ -162,7 +162,7 @@ impl Session {
 
     /// Views the topics. A request fails shortly before the stream of an agent that is stopping
     /// ends.
-    fn view_while(&mut self, lines: &mut Lines<'_>, agent: &Agent) -> Result<()> {
+    fn view_until_end(&mut self, lines: &mut Lines<'_>, agent: &Agent) -> Result<()> {
         let viewed = self.view(agent);
         match viewed {
             Err(_) if ends_soon(lines) => Err(agent_ended().into()),
@@ -202,7 +202,7 @@ impl Session {
         Ok(())
     }
 
-    fn explain_unseen(&mut self) {
+    fn print_unseen_reason(&mut self) {
         let unseen: Vec<_> = self.learner.unseen().collect();
         if !unseen.is_empty() {
             let unseen = unseen.join(", ");
@@ -250,7 +250,7 @@ impl Session {
         let seconds = self.learner.seconds();
         eprintln!(
             "rp: expectations for {expected} of {all} topics, learnt in {seconds} s{}",
-            output.phrase()
+            output.result_text()
         );
     }
 }
@@ -296,23 +296,23 @@ fn time(seconds: f64) -> String {
 
 /// A line on stderr that is updated in place; nothing if stderr is not a terminal.
 struct Progress {
-    is_shown: bool,
+    is_visible: bool,
     /// Whether the command ends with a capture, at an unknown time.
-    is_whole: bool,
+    is_of_capture: bool,
 }
 
 impl Progress {
     fn new(is_whole: bool) -> Self {
         Self {
-            is_shown: stderr().is_terminal(),
-            is_whole,
+            is_visible: stderr().is_terminal(),
+            is_of_capture: is_whole,
         }
     }
 
     fn show(&self, learner: &Learner, seconds: u32) {
-        if self.is_shown {
+        if self.is_visible {
             let (topics, now) = (learner.topics(), learner.seconds());
-            let all = match self.is_whole {
+            let all = match self.is_of_capture {
                 true => "the capture".to_owned(),
                 false => format!("{}:{:02}", seconds / 60, seconds % 60),
             };
@@ -324,7 +324,7 @@ impl Progress {
     }
 
     fn clear(&self) {
-        if self.is_shown {
+        if self.is_visible {
             eprint!("\r\x1b[K");
         }
     }

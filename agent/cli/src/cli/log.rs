@@ -111,7 +111,7 @@ impl Log {
         // A capture is read from its begin.
         let is_replay = self.target.replay.is_some();
         if self.no_follow && !is_replay {
-            printer.earlier(&agent, domain_id)?;
+            printer.print_kept(&agent, domain_id)?;
             return Ok(ExitCode::SUCCESS);
         }
         let names = [ROSOUT_TOPIC.to_owned()];
@@ -120,7 +120,7 @@ impl Log {
         let status = follow(&agent, domain_id, &names, &mut notes, |item, _| {
             // The stream is open now, so no message is missing between both.
             if !std::mem::replace(&mut has_begun, true) {
-                printer.earlier(&agent, domain_id)?;
+                printer.print_kept(&agent, domain_id)?;
             }
             if let StreamItem::Message(sample, payload) = item
                 && sample.message_type == TYPE
@@ -142,7 +142,7 @@ impl Log {
 
 impl Printer<'_> {
     /// Prints the latest messages that the agent keeps.
-    fn earlier(&mut self, agent: &Agent, domain_id: u32) -> Result<()> {
+    fn print_kept(&mut self, agent: &Agent, domain_id: u32) -> Result<()> {
         let logs: Logs<'_> = agent.get(&format!("/logs?domain_id={domain_id}&limit=1000"))?;
         if !logs.is_on {
             eprintln!("rp: the agent keeps no logs: `robot.logs` is `off`");

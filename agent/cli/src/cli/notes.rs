@@ -142,7 +142,7 @@ impl<'a> Notes<'a> {
         if self.is_replay || self.is_explained || self.begun.elapsed() < SILENCE_TIMEOUT {
             return Ok(());
         }
-        self.explain()
+        self.print_explanation()
     }
 
     /// At the end of the stream, reports missing messages and the reason for silence.
@@ -151,10 +151,10 @@ impl<'a> Notes<'a> {
         if self.is_explained {
             return Ok(());
         }
-        self.explain()
+        self.print_explanation()
     }
 
-    fn explain(&mut self) -> Result<()> {
+    fn print_explanation(&mut self) -> Result<()> {
         self.is_explained = true;
         if self.are_parts && !self.heard.is_empty() {
             return Ok(());
@@ -348,7 +348,7 @@ impl Sampling {
         let Self::Sampled(remedy) = self else {
             return None;
         };
-        let names = few(topics);
+        let names = shortened_list(topics);
         let verb = if topics.len() == 1 { "is" } else { "are" };
         let text = format!("{names} {verb} sampled in shared memory; {consequence}; {remedy}");
         (!topics.is_empty()).then_some(text)
@@ -374,7 +374,7 @@ fn counted_inside(topic: &Topic<'_>) -> Option<String> {
     ))
 }
 
-fn few(names: &[String]) -> String {
+fn shortened_list(names: &[String]) -> String {
     let shown: Vec<&str> = names.iter().take(MAX_NAMED_TOPICS).map(String::as_str).collect();
     let shown = shown.join(", ");
     match names.len().saturating_sub(MAX_NAMED_TOPICS) {

@@ -284,7 +284,7 @@ impl Measurement<'_> {
             header_stamp: sample.header_stamp_ns,
         };
         let passes = match &mut self.sieve {
-            Some(sieve) => sieve.passes(sample, payload)?,
+            Some(sieve) => sieve.is_passed(sample, payload)?,
             None => true,
         };
         let types = std::slice::from_ref(&sample.message_type);
@@ -301,7 +301,7 @@ impl Measurement<'_> {
                 };
                 self.rates.arrived_from(&sample.topic, arrival, origin)
             }
-            true => self.rates.arrived(&sample.topic, arrival),
+            true => self.rates.add_message(&sample.topic, arrival),
         }))
     }
 }

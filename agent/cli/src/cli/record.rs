@@ -208,7 +208,7 @@ impl Record {
         let filter = if self.no_discovery {
             let opened = samples.opened().topics.iter();
             let there: Vec<_> = opened.map(|topic| topic.topic.clone()).collect();
-            filter.only(&there)
+            filter.restricted_to(&there)
         } else {
             filter
         };
@@ -300,7 +300,7 @@ impl Record {
     fn begun<'a>(&self, mut recorder: Recorder<'a>) -> Recorder<'a> {
         if self.snapshot_mode {
             let room = usize::try_from(self.max_cache_size).unwrap_or(usize::MAX);
-            recorder = recorder.waiting_in(SampleRing::new(room, None));
+            recorder = recorder.with_ring(SampleRing::new(room, None));
         }
         recorder.pause(self.start_paused);
         recorder

@@ -10,7 +10,7 @@ use ros2probe::ros2::{service, topic};
 use ros2probe_api::names::{Names, ServiceName};
 
 use super::events::ServiceEcho;
-use super::shared::{Graph, Spinning, answer, print_found, print_or_fail, print_text};
+use super::shared::{Graph, Spinning, answer, print_names, print_or_fail, print_text};
 
 /// `rp service VERB`.
 #[derive(Args, Debug)]
@@ -129,7 +129,7 @@ impl Find {
         let found = |names: &Names<'_>, count| {
             topic::find(&self.service_type, shown(names, hidden).map(typed), count)
         };
-        print_found(&graph, self.count_services, found)
+        print_names(&graph, self.count_services, found)
     }
 }
 

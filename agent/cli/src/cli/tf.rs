@@ -146,14 +146,14 @@ impl Tf {
         if answer.trees.is_empty() {
             names_of(&agent, domain_id)?;
         }
-        let topic = topic_of(self.only(&answer)?);
+        let topic = topic_of(self.only_tree(&answer)?);
         let mut recent = Recent::open((!is_replay).then_some(&agent), domain_id, &topic);
         let mut answer = answer;
         loop {
-            let tree = self.only(&answer)?;
+            let tree = self.only_tree(&answer)?;
             recent.history.add_last(tree);
             let explained = |error: NoTransform| {
-                let note = unread(tree).unwrap_or_default();
+                let note = unread_static_note(tree).unwrap_or_default();
                 UserError(format!("{error}{note}"))
             };
             let frames = Frames::new(tree);
@@ -188,7 +188,7 @@ impl Tf {
                 output.write(&format!("{}/tf:\n", visible(&tree.namespace)))?;
             }
             output.write(&frames.tree(answer.timestamp_seconds))?;
-            if let Some(note) = unread(tree) {
+            if let Some(note) = unread_static_note(tree) {
                 eprintln!("rp: {}", note.trim_start_matches("; "));
             }
         }
@@ -209,7 +209,7 @@ impl Tf {
     }
 
     /// Returns the only tree that is selected.
-    fn only<'a>(&self, answer: &'a Transforms<'a>) -> Result<&'a TransformTree<'a>> {
+    fn only_tree<'a>(&self, answer: &'a Transforms<'a>) -> Result<&'a TransformTree<'a>> {
         let trees: Vec<_> = self.trees(answer).collect();
         match trees[..] {
             [tree] => Ok(tree),
@@ -235,7 +235,7 @@ fn topic_of(tree: &TransformTree<'_>) -> String {
 }
 
 /// Returns a note if static transforms are missing because the agent came later.
-fn unread(tree: &TransformTree<'_>) -> Option<String> {
+fn unread_static_note(tree: &TransformTree<'_>) -> Option<String> {
     let count = tree.unread_static_publishers;
     let publishers = if count == 1 {
         "publisher"

@@ -12,7 +12,7 @@ use ros2probe_api::names::{Names, TopicName};
 use super::echo::Echo;
 use super::interrupt::EXIT_INTERRUPTED;
 use super::rates::{Bandwidth, Delay, Hz};
-use super::shared::{Graph, Spinning, answer, print_found, print_or_fail, print_text};
+use super::shared::{Graph, Spinning, answer, print_names, print_or_fail, print_text};
 
 /// `rp topic VERB`.
 #[derive(Args, Debug)]
@@ -165,7 +165,7 @@ impl Find {
         let found = |names: &Names<'_>, count| {
             topic::find(&self.topic_type, shown(names, hidden).map(typed), count)
         };
-        print_found(&graph, self.count_topics, found)
+        print_names(&graph, self.count_topics, found)
     }
 }
 

@@ -105,7 +105,7 @@ impl<'a> Lines<'a> {
                     return Err(self
                         .agent
                         .transport
-                        .broke("the stream ended within a message"));
+                        .broken_connection("the stream ended within a message"));
                 }
             }
             self.searched = 0;
@@ -147,7 +147,7 @@ impl<'a> Lines<'a> {
                         return Ok(true);
                     }
                 }
-                Some(Err(error)) => return Err(self.agent.transport.broke(error)),
+                Some(Err(error)) => return Err(self.agent.transport.broken_connection(error)),
             }
         }
         Ok(false)
@@ -166,6 +166,6 @@ impl<'a> Lines<'a> {
             frame = timeout(DRAIN_TIMEOUT, self.body.frame()).await;
         }
         self.waited = Duration::ZERO;
-        frame.map_err(|_| self.agent.transport.slow())
+        frame.map_err(|_| self.agent.transport.timed_out())
     }
 }

@@ -151,7 +151,7 @@ impl Agent {
     pub fn get_visible<T: DeserializeOwned>(&self, path: &str) -> Result<T, ClientError> {
         let answer = self.get(path)?;
         serde_json::from_value(visible_text(answer))
-            .map_err(|source| self.transport.unreadable(path, source))
+            .map_err(|source| self.transport.unreadable_answer(path, source))
     }
 
     /// Requests `path` like [`Self::get`], and waits for the answer for at most `longest`.
@@ -201,7 +201,7 @@ impl Agent {
     pub fn delete(&self, path: &str) -> Result<(), ClientError> {
         self.runtime.block_on(async {
             let answer = self.send(Method::DELETE, path, None).await?;
-            self.whole(path, answer).await.map(drop)
+            self.read_body(path, answer).await.map(drop)
         })
     }
 
@@ -225,7 +225,7 @@ impl Agent {
                 let silence = (!self.transport.is_replayed()).then_some(silence);
                 Ok(Lines::new(self, answer.into_body(), silence))
             } else {
-                let refused = self.whole(path, answer).await;
+                let refused = self.read_body(path, answer).await;
                 Err(refused
                     .err()
                     .unwrap_or_else(|| self.transport.not_an_agent()))
@@ -235,13 +235,13 @@ impl Agent {
 
     /// Decodes the JSON of a line or an answer.
     fn decoded<T: DeserializeOwned>(&self, path: &str, text: &[u8]) -> Result<T, ClientError> {
-        serde_json::from_slice(text).map_err(|source| self.transport.unreadable(path, source))
+        serde_json::from_slice(text).map_err(|source| self.transport.unreadable_answer(path, source))
     }
 
     /// Returns the error of a connection that closed before the answer.
-    fn hung_up(&self, path: &str) -> ClientError {
+    fn connection_closed(&self, path: &str) -> ClientError {
         self.transport
-            .broke(format!("{path} ended before its first byte"))
+            .broken_connection(format!("{path} ended before its first byte"))
     }
 
     /// Returns whether the agent replays a capture within this process.
@@ -272,10 +272,10 @@ impl Agent {
         let answer = self.runtime.block_on(async {
             let exchange = async {
                 let answer = self.send(method, path, body).await?;
-                self.whole(path, answer).await
+                self.read_body(path, answer).await
             };
             let answer = timeout(longest, exchange).await;
-            answer.unwrap_or_else(|_| Err(self.transport.slow()))
+            answer.unwrap_or_else(|_| Err(self.transport.timed_out()))
         })?;
         self.decoded(path, &answer)
     }
@@ -305,20 +305,20 @@ impl Agent {
             return self.transport.send(request).await;
         }
         let answer = timeout(STREAM_SILENCE, self.transport.send(request)).await;
-        answer.unwrap_or_else(|_| Err(self.transport.slow()))
+        answer.unwrap_or_else(|_| Err(self.transport.timed_out()))
     }
 
     /// Reads the whole body of a successful answer; problem details become an error.
-    async fn whole(&self, path: &str, answer: Response<Incoming>) -> Result<Bytes, ClientError> {
+    async fn read_body(&self, path: &str, answer: Response<Incoming>) -> Result<Bytes, ClientError> {
         let status = answer.status();
         let mut body = Limited::new(answer.into_body(), MAX_ANSWER);
         let mut whole = BytesMut::new();
         loop {
             let frame = timeout(STREAM_SILENCE, body.frame()).await;
-            let Some(frame) = frame.map_err(|_| self.transport.slow())? else {
+            let Some(frame) = frame.map_err(|_| self.transport.timed_out())? else {
                 break;
             };
-            let frame = frame.map_err(|source| self.transport.broke(source))?;
+            let frame = frame.map_err(|source| self.transport.broken_connection(source))?;
             whole.extend_from_slice(&frame.into_data().unwrap_or_default());
         }
         let body = whole.freeze();
@@ -330,7 +330,7 @@ impl Agent {
         };
         Err(match (status, refusal.code.as_str()) {
             (StatusCode::UNAUTHORIZED, _) => self.transport.unauthorized(self.token.is_some()),
-            (_, code) if code == Code::NotFound.as_str() => self.transport.older(path),
+            (_, code) if code == Code::NotFound.as_str() => self.transport.older_agent(path),
             _ => ClientError::Refused(refusal),
         })
     }

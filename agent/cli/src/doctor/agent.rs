@@ -31,7 +31,7 @@ const MAX_NAMED_WATCHES: usize = 5;
 #[must_use]
 pub fn check(answers: &Answers, place: &str, own_version: &str) -> Vec<Finding> {
     let health = &answers.health;
-    let mut findings = vec![running(health, place), version(health, own_version)];
+    let mut findings = vec![running_finding(health, place), version(health, own_version)];
     findings.extend(losses(health));
     findings.extend(limits(health));
     findings.extend(evictions(health));
@@ -39,7 +39,7 @@ pub fn check(answers: &Answers, place: &str, own_version: &str) -> Vec<Finding> 
     findings.extend(health.foxglove.as_ref().map(foxglove));
     findings.extend(zenoh(health));
     if health.source != "replay" {
-        findings.push(kept(health));
+        findings.push(kept_watches_finding(health));
     }
     findings
 }
@@ -85,7 +85,7 @@ pub fn misconfigured(path: &Path, mistakes: &str) -> Finding {
     finding.remedy("rp check-config    # prints all mistakes")
 }
 
-fn running(health: &Health, place: &str) -> Finding {
+fn running_finding(health: &Health, place: &str) -> Finding {
     let since = health
         .uptime_seconds
         .map_or_else(String::new, |up| format!(", up {}", duration(up)));
@@ -399,7 +399,7 @@ fn foxglove(listener: &Foxglove) -> Finding {
     )
 }
 
-fn kept(health: &Health) -> Finding {
+fn kept_watches_finding(health: &Health) -> Finding {
     let finding = if health.watches_kept {
         let sentence = "state is kept across restarts";
         Finding::new(AREA, "state", Severity::Ok, sentence)
@@ -428,11 +428,11 @@ fn ports(host: &HostState, config: &Config) -> Vec<Finding> {
         .filter_map(|(key, address)| Some((key, address?)));
     wanted
         .filter(|(_, address)| taken.contains(&address.port()))
-        .map(|(key, address)| busy(key, address))
+        .map(|(key, address)| port_in_use_finding(key, address))
         .collect()
 }
 
-fn busy(key: &str, address: SocketAddr) -> Finding {
+fn port_in_use_finding(key: &str, address: SocketAddr) -> Finding {
     let port = address.port();
     let sentence = format!("port {port} is in use by another program: the agent would not start");
     let finding = Finding::new(AREA, "ports", Severity::Problem, sentence);

@@ -53,7 +53,7 @@ impl Answers {
             topics: agent.get(&format!("/topics{within}"))?,
             watches: agent.get("/watch")?,
             clocks: match agent.get("/clocks") {
-                Err(ClientError::Older { .. }) => Clocks::default(),
+                Err(ClientError::OlderAgent { .. }) => Clocks::default(),
                 answer => answer?,
             },
         })

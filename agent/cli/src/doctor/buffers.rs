@@ -7,7 +7,7 @@
 //! the requested size.
 
 use super::answers::Answers;
-use super::host_state::{Files, HostState, Unread};
+use super::host_state::{Files, HostState, ReadFailure};
 use ros2probe_api::doctor::{Area, Finding, Severity};
 use ros2probe_api::measurement::Measurement;
 use ros2probe_api::topics::Topic;
@@ -54,7 +54,7 @@ pub fn check(host: &HostState, answers: Option<&Answers>) -> Vec<Finding> {
     let topics = answers.map_or(&[][..], |answers| &answers.topics.topics);
     let largest = largest(topics);
     let mut findings = vec![receive(&host.files, largest.as_ref())];
-    findings.extend(lost(
+    findings.extend(loss_finding(
         topics,
         "socket_losses",
         "in full socket buffers",
@@ -64,7 +64,7 @@ pub fn check(host: &HostState, answers: Option<&Answers>) -> Vec<Finding> {
                 .map_or(0, |received| received.lost_in_socket_buffer_messages)
         },
         |finding| {
-            let bytes = wanted(largest.as_ref(), MESSAGES_IN_BUFFER);
+            let bytes = recommended_size(largest.as_ref(), MESSAGES_IN_BUFFER);
             finding
                 .remedy(RECEIVE_DEFAULT.set(bytes))
                 .remedy(RECEIVE_MAX.set(bytes))
@@ -81,7 +81,7 @@ pub fn check(host: &HostState, answers: Option<&Answers>) -> Vec<Finding> {
         &host.files,
         largest.as_ref().filter(|_| is_large),
     ));
-    findings.extend(lost(
+    findings.extend(loss_finding(
         topics,
         "reassembly_losses",
         "in IP reassembly, because a fragment was missing",
@@ -122,7 +122,7 @@ fn largest(topics: &[Topic<'_>]) -> Option<Largest> {
 }
 
 /// Returns the size of `messages` of the largest messages, rounded up to whole mebibytes.
-fn wanted(largest: Option<&Largest>, messages: u64) -> u64 {
+fn recommended_size(largest: Option<&Largest>, messages: u64) -> u64 {
     let bytes = largest.map_or(DEFAULT_MESSAGE, |largest| largest.bytes);
     bytes
         .saturating_mul(messages)
@@ -141,7 +141,7 @@ fn receive(files: &Files, largest: Option<&Largest>) -> Finding {
                 .remedy("sysctl net.core.rmem_max    # on the host itself")
         }
         Ok(most) => {
-            let wanted = wanted(largest, MESSAGES_IN_BUFFER);
+            let wanted = recommended_size(largest, MESSAGES_IN_BUFFER);
             let (severity, words) = match largest {
                 None if *most >= wanted => (
                     Severity::Ok,
@@ -203,7 +203,7 @@ fn reassembly(files: &Files, largest: Option<&Largest>) -> Vec<Finding> {
             }
             continue;
         };
-        let wanted = wanted(largest, MESSAGES_IN_REASSEMBLY);
+        let wanted = recommended_size(largest, MESSAGES_IN_REASSEMBLY);
         let version = if number == 0 { "IPv4" } else { "IPv6" };
         let finding = match largest {
             Some(largest) if most < wanted => {
@@ -239,7 +239,7 @@ fn reassembly(files: &Files, largest: Option<&Largest>) -> Vec<Finding> {
 }
 
 /// Returns the finding for messages lost at `place`; `None` if no message was lost.
-fn lost(
+fn loss_finding(
     topics: &[Topic<'_>],
     check: &'static str,
     place: &str,
@@ -285,7 +285,7 @@ impl Sysctl {
         format!("/proc/sys/{}", self.0.replace('.', "/"))
     }
 
-    fn read(self, files: &Files) -> Result<u64, Unread> {
+    fn read(self, files: &Files) -> Result<u64, ReadFailure> {
         files.number(&self.path())
     }
 
@@ -301,7 +301,7 @@ impl Sysctl {
         )
     }
 
-    fn show(self, finding: Finding, value: &Result<u64, Unread>) -> Finding {
+    fn show(self, finding: Finding, value: &Result<u64, ReadFailure>) -> Finding {
         let value = match value {
             Ok(value) => value.to_string(),
             Err(error) => error.to_string(),

@@ -153,12 +153,12 @@ fn milliseconds(microseconds: i64) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::host_state::Unread;
+    use super::super::host_state::ReadFailure;
     use super::super::host_state::tests::host;
     use super::*;
     use ros2probe_capture::system::ClockState;
 
-    fn found(clock: Result<ClockState, Unread>) -> Finding {
+    fn found(clock: Result<ClockState, ReadFailure>) -> Finding {
         let (_directory, mut host) =
             host(&[("/proc/5/comm", "chronyd\n"), ("/proc/6/comm", "sshd\n")]);
         host.clock = clock;
@@ -220,7 +220,7 @@ mod tests {
             Severity::Note
         );
         assert_eq!(found(Ok(state(false, 0, 0))).severity, Severity::Warning);
-        let unknown = found(Err(Unread::NotPermitted));
+        let unknown = found(Err(ReadFailure::NotPermitted));
         assert_eq!(unknown.severity, Severity::Unknown);
         assert!(!unknown.remedies.is_empty());
     }

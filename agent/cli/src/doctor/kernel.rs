@@ -4,7 +4,7 @@
 use std::path::Path;
 
 use super::cgroup::CgroupHierarchy;
-use super::host_state::{HostState, Unread};
+use super::host_state::{HostState, ReadFailure};
 use ros2probe_api::doctor::{Area, Finding, Severity};
 
 const AREA: Area = Area::Kernel;
@@ -42,7 +42,7 @@ pub fn check(host: &HostState, is_agent_running: bool) -> Vec<Finding> {
     findings
 }
 
-fn version(release: &Result<String, Unread>) -> Finding {
+fn version(release: &Result<String, ReadFailure>) -> Finding {
     let report = |severity, sentence: String| Finding::new(AREA, "version", severity, sentence);
     match release {
         Err(error) => report(Severity::Unknown, "the kernel version is unknown".into())
@@ -93,7 +93,7 @@ fn compiler(host: &HostState) -> Finding {
         Ok(value) => report(Severity::Ok, "BPF programs are compiled (JIT)")
             .seen(value.to_string(), JIT_PATH),
         // Visible only in the initial network namespace.
-        Err(Unread::Missing) => report(
+        Err(ReadFailure::Missing) => report(
             Severity::Ok,
             "BPF JIT status is not visible inside a container",
         )
@@ -367,7 +367,7 @@ mod tests {
     }
 
     #[test]
-    fn the_mount_beside_version_1_hides_none_of_its_controllers() {
+    fn a_version_2_mount_hides_no_controller_of_version_1() {
         for (mounts, place) in [
             (
                 "24 18 0:22 / /sys/fs/cgroup/cpu rw - cgroup cgroup rw,cpu",

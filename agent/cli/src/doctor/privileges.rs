@@ -38,7 +38,7 @@ pub fn check(
     settings: &CaptureSettings,
     answers: Option<&Answers>,
 ) -> Vec<Finding> {
-    let mut findings = vec![own(host, settings, answers.is_some())];
+    let mut findings = vec![own_privileges(host, settings, answers.is_some())];
     findings.extend(answers.map(|answers| of_agent(&answers.health)));
     findings.extend(answers.and_then(containers));
     findings.extend(probes(host, settings));
@@ -46,7 +46,7 @@ pub fn check(
     findings
 }
 
-fn own(host: &HostState, settings: &CaptureSettings, is_running: bool) -> Finding {
+fn own_privileges(host: &HostState, settings: &CaptureSettings, is_running: bool) -> Finding {
     let held = privilege::capability_names(host.capabilities);
     let held = match held.len() {
         0 => "none".to_owned(),
@@ -68,7 +68,7 @@ fn own(host: &HostState, settings: &CaptureSettings, is_running: bool) -> Findin
         ),
         Some(missing) => report(
             Severity::Note,
-            format!("this shell cannot capture: it lacks {}", missing.needs()),
+            format!("this shell cannot capture: it lacks {}", missing.missing_text()),
         )
         .remedy("sudo rp run    # or the service ros2probe")
         .remedy(missing.command()),
@@ -151,7 +151,7 @@ fn probes(host: &HostState, settings: &CaptureSettings) -> Option<Finding> {
         (false, true) => "capture.inside needs",
         (true, true) => "capture.shm.exact and capture.inside need",
     };
-    let missing = uprobe::lacking(host.capabilities);
+    let missing = uprobe::missing_capabilities(host.capabilities);
     let socket = settings.broker.display().to_string();
     if missing.is_empty() || host.files.exists(&socket) {
         return None;
@@ -267,7 +267,7 @@ mod tests {
     fn a_shell_without_capabilities_gets_their_names_and_the_command() {
         let (_directory, mut host) = host(&[]);
         let settings = Config::default().capture;
-        let finding = own(&host, &settings, false);
+        let finding = own_privileges(&host, &settings, false);
         assert_eq!(finding.severity, Severity::Note);
         assert!(
             finding.sentence.contains("CAP_NET_ADMIN"),
@@ -280,9 +280,9 @@ mod tests {
                 .iter()
                 .any(|remedy| remedy.line.starts_with("sudo setcap "))
         );
-        assert_eq!(own(&host, &settings, true).severity, Severity::Ok);
+        assert_eq!(own_privileges(&host, &settings, true).severity, Severity::Ok);
         host.capabilities = CapabilitySet::SYS_ADMIN | CapabilitySet::NET_ADMIN;
-        assert_eq!(own(&host, &settings, false).severity, Severity::Ok);
+        assert_eq!(own_privileges(&host, &settings, false).severity, Severity::Ok);
     }
 
     #[test]

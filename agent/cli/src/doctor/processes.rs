@@ -7,7 +7,7 @@
 
 use std::collections::BTreeMap;
 
-use super::host_state::{HostState, Unread, base_name};
+use super::host_state::{HostState, ReadFailure, base_name};
 use super::variables::{Range, Variables};
 use ros2probe_api::doctor::{Area, Finding, Severity};
 use ros2probe_api::participants::ParticipantList;
@@ -86,8 +86,8 @@ impl Processes {
             match read_process(host, id, command, domain_id) {
                 Ok(Some(_)) if processes.found.len() >= MAX_PROCESSES => break,
                 Ok(Some(process)) => processes.found.push(process),
-                Ok(None) | Err(Unread::Missing | Unread::Other(_)) => {}
-                Err(Unread::NotPermitted) => processes.closed.push(id),
+                Ok(None) | Err(ReadFailure::Missing | ReadFailure::Other(_)) => {}
+                Err(ReadFailure::NotPermitted) => processes.closed.push(id),
             }
         }
         processes
@@ -120,25 +120,25 @@ impl Processes {
         findings.extend(self.unseen(host.is_root()));
         findings.extend(self.unread_implementations());
         findings.extend(self.agnocast());
-        let domains = self.differing(
+        let domains = self.different_values(
             "domain",
             "nodes in different domains do not see each other",
             "export ROS_DOMAIN_ID=N    # the same for all nodes",
             |process| Some(process.domain()),
         );
-        let implementations = self.differing(
+        let implementations = self.different_values(
             "rmw",
             "mixed RMWs: topics may work only partly, services are unreliable",
             "export RMW_IMPLEMENTATION=rmw_cyclonedds_cpp    # the same for all nodes",
             |process| process.implementation.map(str::to_owned),
         );
-        let ranges = self.differing(
+        let ranges = self.different_values(
             "range",
             "nodes limited to localhost are not discovered from other hosts",
             "export ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET    # the same for all; unset ROS_LOCALHOST_ONLY",
             |process| Some(process.variables.range().words()),
         );
-        let servers = self.differing(
+        let servers = self.different_values(
             "discovery_server",
             "nodes with different discovery servers do not discover each other",
             "export ROS_DISCOVERY_SERVER=ADDRESS:11811    # the same for all, or unset for all",
@@ -150,7 +150,7 @@ impl Processes {
                 ))
             },
         );
-        let easy_modes = self.differing(
+        let easy_modes = self.different_values(
             "easy_mode",
             "nodes in easy mode see only nodes with the same server",
             "export ROS2_EASY_MODE=ADDRESS    # the same for all, or unset for all",
@@ -162,7 +162,7 @@ impl Processes {
                 ))
             },
         );
-        let security = self.differing(
+        let security = self.different_values(
             "security",
             "secured and unsecured nodes do not communicate",
             "export ROS_SECURITY_ENABLE=true    # for all, or for none",
@@ -180,7 +180,7 @@ impl Processes {
             security,
         ];
         findings.extend(all.into_iter().flatten());
-        findings.extend(self.unlike(&Variables::of(&host.environment)));
+        findings.extend(self.different_domain(&Variables::of(&host.environment)));
         findings
     }
 
@@ -264,7 +264,7 @@ impl Processes {
     }
 
     /// Warns if processes have different values of `key`.
-    fn differing(
+    fn different_values(
         &self,
         check: &'static str,
         consequence: &str,
@@ -299,7 +299,7 @@ impl Processes {
     }
 
     /// Warns if no process is in the domain of this shell.
-    fn unlike(&self, shell: &Variables) -> Option<Finding> {
+    fn different_domain(&self, shell: &Variables) -> Option<Finding> {
         let own = shell.domain().ok().filter(|_| shell.is_ros())?;
         let mut domains: Vec<_> = self.found.iter().map(Process::domain_id).collect();
         domains.sort_unstable();
@@ -343,7 +343,7 @@ fn read_process(
     id: u32,
     command: String,
     domain_id: Option<u32>,
-) -> Result<Option<Process>, Unread> {
+) -> Result<Option<Process>, ReadFailure> {
     let map = host.files.bytes(&format!("/proc/{id}/maps"), MAX_MAP)?;
     let map = String::from_utf8_lossy(&map);
     let implementation = implementation(&map);

@@ -1,7 +1,7 @@
 //! Checks of this shell's ROS variables: their effect on nodes and tools started from it, and which
 //! of their traffic the agent cannot see.
 
-use super::host_state::{HostState, Unread};
+use super::host_state::{HostState, ReadFailure};
 use super::variables::{Range, Variables};
 use ros2probe_api::doctor::{Area, Finding, Severity};
 use ros2probe_wire::DomainId;
@@ -260,7 +260,7 @@ fn profiles(host: &HostState, variables: &Variables) -> Vec<Finding> {
 }
 
 /// Reads a file named by a variable, relative to this shell's directory.
-fn read(host: &HostState, path: &str) -> Result<Vec<u8>, Unread> {
+fn read(host: &HostState, path: &str) -> Result<Vec<u8>, ReadFailure> {
     let path = std::path::absolute(path)?;
     host.files.bytes(&path.to_string_lossy(), MAX_PROFILE)
 }

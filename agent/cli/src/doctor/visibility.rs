@@ -52,7 +52,7 @@ impl Visibility {
             source: facts.source.label().to_owned(),
             source_reason: facts.source_reason,
             able: facts.abilities,
-            reasons: facts.blind,
+            reasons: facts.missing_abilities,
             from: TRIAL_SOURCE,
         }
     }
@@ -60,7 +60,7 @@ impl Visibility {
 
 /// Returns the findings for a host without an agent and without permission for a trial.
 #[must_use]
-pub fn untried(reason: &str) -> Vec<Finding> {
+pub fn untried_findings(reason: &str) -> Vec<Finding> {
     let sentence = "kernel support was not tested";
     let finding = Finding::new(AREA, "source", Severity::Unknown, sentence);
     vec![
@@ -72,7 +72,7 @@ pub fn untried(reason: &str) -> Vec<Finding> {
 
 /// Returns the findings for a trial that failed.
 #[must_use]
-pub fn failed(error: &str) -> Vec<Finding> {
+pub fn failed_trial_findings(error: &str) -> Vec<Finding> {
     let sentence = format!("the agent cannot observe this host: {error}");
     let finding = Finding::new(AREA, "source", Severity::Problem, sentence);
     vec![
@@ -97,7 +97,7 @@ pub fn check(visibility: &Visibility) -> Vec<Finding> {
     findings.extend(
         blind
             .into_iter()
-            .filter_map(|ability| lacking(visibility, ability)),
+            .filter_map(|ability| missing_ability_finding(visibility, ability)),
     );
     findings
 }
@@ -147,7 +147,7 @@ const fn words(ability: Ability) -> &'static str {
 }
 
 /// Returns the finding for an unavailable ability; `None` if the source's own line covers it.
-fn lacking(visibility: &Visibility, ability: Ability) -> Option<Finding> {
+fn missing_ability_finding(visibility: &Visibility, ability: Ability) -> Option<Finding> {
     let reason = visibility
         .reasons
         .iter()
@@ -355,9 +355,9 @@ mod tests {
 
     #[test]
     fn without_a_trial_the_command_for_one_is_reported() {
-        let findings = untried("CAP_BPF is missing");
+        let findings = untried_findings("CAP_BPF is missing");
         assert_eq!(findings[0].severity, Severity::Unknown);
         assert_eq!(findings[0].remedies[0].line, "sudo rp doctor");
-        assert_eq!(failed("x")[0].severity, Severity::Problem);
+        assert_eq!(failed_trial_findings("x")[0].severity, Severity::Problem);
     }
 }

@@ -67,7 +67,7 @@ pub(super) fn find(
             .iter()
             .map(|(name, traits)| (name, traits.get(what)))
             .collect();
-        let Some(usual) = usual(&values) else {
+        let Some(usual) = majority_value(&values) else {
             continue;
         };
         let same = |value: Option<&Trait>| is_same(value, usual);
@@ -89,7 +89,7 @@ pub(super) fn find(
 }
 
 /// Returns the value that more than half of the robots have.
-fn usual<'a>(values: &[(&String, Option<&'a Trait>)]) -> Option<Option<&'a Trait>> {
+fn majority_value<'a>(values: &[(&String, Option<&'a Trait>)]) -> Option<Option<&'a Trait>> {
     let candidates = values.iter().map(|(_, value)| *value);
     candidates
         .map(|candidate| {

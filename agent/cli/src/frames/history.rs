@@ -215,7 +215,7 @@ mod tests {
     }
 
     #[test]
-    fn transforms_end_after_ten_seconds_or_when_their_clock_goes_back() {
+    fn transforms_are_dropped_after_ten_seconds_or_when_their_clock_steps_back() {
         let mut history = History::default();
         let edge = ["odom", "base"];
         history.add(edge, (10, 0), pose(1.0, 0.0));

@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use super::Learnt;
 use super::thresholds::{
-    LATENCY_DEVIATIONS, LEAST_LOSS, Lesson, RATE_DEVIATIONS, RATE_MARGIN, Remark, SILENCE_MARGIN,
+    LATENCY_DEVIATIONS, LEAST_LOSS, TopicThresholds, RATE_DEVIATIONS, RATE_MARGIN, Remark, SILENCE_MARGIN,
 };
 use ros2probe_api::parameters::Parameters;
 use ros2probe_daemon::config::MAX_PARAMETERS;
@@ -104,7 +104,7 @@ pub fn parameters(known: &Parameters<'_>, domain_id: u32) -> String {
 
 /// Returns whether a topic has any expectation.
 #[must_use]
-pub fn is_expected(lesson: &Lesson) -> bool {
+pub fn is_expected(lesson: &TopicThresholds) -> bool {
     let mut remarks = lesson.remarks.iter();
     remarks.any(|remark| matches!(remark, Remark::Set(..)))
 }
@@ -139,7 +139,7 @@ fn head(source: &Source<'_>) -> String {
     )
 }
 
-fn entry(text: &mut String, lesson: &Lesson, source: &Source<'_>, is_explained: bool) {
+fn entry(text: &mut String, lesson: &TopicThresholds, source: &Source<'_>, is_explained: bool) {
     let name = &lesson.topic;
     if is_expected(lesson) {
         line(text, &format!("  - topic: {name}"));

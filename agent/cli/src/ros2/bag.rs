@@ -56,7 +56,7 @@ pub fn info(bag: &Bag, dialect: Dialect, sort: Sort, details: Option<&Details>) 
     line("End:", &moment(end, zone));
     line(
         "Messages:",
-        &metadata.message_count.saturating_sub(parts.apart),
+        &metadata.message_count.saturating_sub(parts.of_services_and_actions),
     );
     let topics: Vec<String> = parts
         .topics
@@ -115,7 +115,7 @@ struct Parts<'a> {
     services: Vec<&'a Topic>,
     actions: Vec<Action<'a>>,
     /// Number of messages of services and actions.
-    apart: u64,
+    of_services_and_actions: u64,
 }
 
 struct Action<'a> {
@@ -132,7 +132,7 @@ impl<'a> Parts<'a> {
             topics: Vec::new(),
             services: Vec::new(),
             actions: Vec::new(),
-            apart: 0,
+            of_services_and_actions: 0,
         };
         for topic in all {
             let is_event = topic.name.ends_with(SERVICE_EVENT)
@@ -150,10 +150,10 @@ impl<'a> Parts<'a> {
             if dialect > Dialect::Jazzy
                 && let Some(part) = of_action()
             {
-                parts.apart = parts.apart.saturating_add(topic.message_count);
+                parts.of_services_and_actions = parts.of_services_and_actions.saturating_add(topic.message_count);
                 parts.action(topic, part);
             } else if dialect > Dialect::Humble && is_event {
-                parts.apart = parts.apart.saturating_add(topic.message_count);
+                parts.of_services_and_actions = parts.of_services_and_actions.saturating_add(topic.message_count);
                 parts.services.push(topic);
             } else {
                 parts.topics.push(topic);

@@ -103,7 +103,7 @@ impl MeasureRequests {
     }
 
     /// Removes a topic whose connection failed. Returns the status line.
-    pub(super) fn lost(&mut self, key: &Key, why: String) -> String {
+    pub(super) fn remove_failed(&mut self, key: &Key, why: String) -> String {
         self.all.remove(key);
         why
     }
@@ -151,7 +151,7 @@ impl Stream {
                         }
                     }
                 }
-                Err(error @ (ClientError::Refused(_) | ClientError::Older { .. })) => {
+                Err(error @ (ClientError::Refused(_) | ClientError::OlderAgent { .. })) => {
                     let _ = self
                         .requests
                         .send(Request::Lost(self.key, error.to_string()));

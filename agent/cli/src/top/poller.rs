@@ -13,7 +13,7 @@ use super::app::{Command, Fact};
 use super::measure_requests::MeasureRequests;
 use super::row::Key;
 use super::server_sent::Messages;
-use super::text::safe;
+use super::text::escaped;
 use crate::client::{Agent, ClientError};
 use ros2probe_api::events::{Event, Lagged};
 use ros2probe_api::health::Health;
@@ -128,7 +128,7 @@ impl Poll {
                 match asked.recv_timeout(left) {
                     Ok(Request::Command(command)) => self.execute(command),
                     Ok(Request::Lost(key, why)) => {
-                        let status = self.holds.lost(&key, why);
+                        let status = self.holds.remove_failed(&key, why);
                         self.send_measured(status);
                     }
                     Err(RecvTimeoutError::Timeout) => break,
@@ -238,7 +238,7 @@ fn fact(event: &str, data: &str) -> Option<Fact> {
     let read = serde_json::from_str::<Event<'_>>(data).or_else(|_| {
         // Unknown events are shown rather than dropped.
         serde_json::from_str::<Value>(data).map(|_| Event {
-            name: safe(event).into(),
+            name: escaped(event).into(),
             ..Event::default()
         })
     });

@@ -104,7 +104,7 @@ impl Field {
             Self::Domain => row.key.domain_id.to_string(),
             Self::Type => row.message_type.clone(),
             Self::Rate => known(row.rate, text::rate),
-            Self::Wanted => match row.wanted {
+            Self::Wanted => match row.expected_rate {
                 (None, None) => String::new(),
                 (Some(least), None) => format!(">={}", text::bound(least)),
                 (None, Some(most)) => format!("<={}", text::bound(most)),
@@ -130,7 +130,7 @@ impl Table {
     #[must_use]
     pub fn plan(width: usize, rows: &[&Row], cut: char) -> Self {
         let domains: BTreeSet<_> = rows.iter().map(|row| row.key.domain_id).collect();
-        let is_expected = rows.iter().any(|row| row.wanted != (None, None));
+        let is_expected = rows.iter().any(|row| row.expected_rate != (None, None));
         let is_late = rows.iter().any(|row| row.late.is_some());
         let longest = |field: Field| {
             let lengths = rows.iter().map(|row| field.value(row).chars().count());
@@ -194,7 +194,7 @@ impl Table {
     /// Returns all columns, each as wide as its widest cell.
     #[must_use]
     pub fn whole(rows: &[&Row], cut: char) -> Self {
-        let is_expected = rows.iter().any(|row| row.wanted != (None, None));
+        let is_expected = rows.iter().any(|row| row.expected_rate != (None, None));
         let fields = Field::ORDER.into_iter();
         let is_late = rows.iter().any(|row| row.late.is_some());
         let fields = fields.filter(|field| match field {

@@ -12,7 +12,7 @@ use super::details::{self, Styled};
 use super::header;
 use super::help;
 use super::table::Table;
-use super::text::{beginning, safe};
+use super::text::{beginning, escaped};
 use super::theme::{Kind, Theme};
 
 /// Minimum usable size: columns and lines.
@@ -146,7 +146,7 @@ fn topics(app: &App, frame: &mut Frame<'_>, area: Rect, theme: Theme) {
     let visible = rows.iter().skip(app.offset).zip(0..body.height);
     for (row, at) in visible {
         let is_selected = app.selected.as_ref() == Some(&row.key);
-        let hold = match app.holds.get(&row.key) {
+        let hold = match app.measured_topics.get(&row.key) {
             None => ' ',
             Some(MeasuredBy::Session) => '+',
             Some(MeasuredBy::Watch) => '=',
@@ -202,7 +202,7 @@ fn events(app: &App, frame: &mut Frame<'_>, area: Rect, theme: Theme) {
 fn footer(app: &App, frame: &mut Frame<'_>, area: Rect, theme: Theme, now: Instant) {
     let last = area.height.saturating_sub(1);
     if app.editing.is_some() {
-        let text = format!("/{}", safe(&app.filter.text));
+        let text = format!("/{}", escaped(&app.filter.text));
         put(frame, area, last, &text, theme, Kind::Plain);
         let column = u16::try_from(text.len()).unwrap_or(u16::MAX);
         let x = area.x + column.min(area.width.saturating_sub(1));

@@ -271,7 +271,7 @@ fn signals_reach_rp_because_it_replaces_python() -> Result<()> {
 }
 
 #[test]
-fn rp_in_path_precedes_the_package_and_none_is_one_clear_line() -> Result<()> {
+fn rp_in_path_precedes_the_package_and_its_absence_is_one_line() -> Result<()> {
     const FIND: &str = "from ros2probe_cli.program import find; print(find())";
     let prefix = prefix()?;
     let found = succeed(&mut python(prefix.path(), FIND, &[]))?;

@@ -189,7 +189,7 @@ fn while_repeating(
 }
 
 #[test]
-fn what_the_robot_says_has_a_view_of_each_part() -> Result<()> {
+fn the_page_shows_logs_diagnostics_parameters_transforms_and_lifecycle() -> Result<()> {
     let link = Link::new()?;
     let config = tempfile::tempdir()?;
     let agent = robot_parts::agent(&link, &config, "")?;
@@ -275,7 +275,7 @@ fn unix_time() -> u64 {
 }
 
 #[test]
-fn tasks_beside_a_running_robot_take_few_clicks() -> Result<()> {
+fn tasks_on_a_running_robot_need_few_clicks() -> Result<()> {
     let place = Place::new()?;
     let state = place.directory.path().join("state");
     std::fs::create_dir(&state)?;
@@ -309,7 +309,7 @@ fn tasks_beside_a_running_robot_take_few_clicks() -> Result<()> {
 }
 
 #[test]
-fn tasks_on_captures_take_few_clicks() -> Result<()> {
+fn tasks_on_captures_need_few_clicks() -> Result<()> {
     let capture = data("cyclonedds/points-besteffort-lossy-2ns");
     let mut lossy = LocalAgent::replay(&mut rp(), &capture, &["--watch", "/**"]);
     lossy.wait_for_log("the capture has ended");
@@ -432,7 +432,7 @@ fn the_page_of_a_capture_shows_an_incident_of_the_past() -> Result<()> {
 }
 
 #[test]
-fn a_replay_is_paused_and_goes_to_the_next_event_in_the_page() -> Result<()> {
+fn the_page_pauses_a_replay_and_jumps_to_the_next_event() -> Result<()> {
     let capture = data("cyclonedds/points-besteffort-lossy-2ns");
     let agent = LocalAgent::replay(&mut rp(), &capture, &["--watch", "/**", "--speed", "0.1"]);
     watch(&[], "replay", &[&page(&agent)])

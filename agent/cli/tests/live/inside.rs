@@ -250,7 +250,7 @@ fn calls_are_observed_while_a_client_requests_them_and_names_always() -> Result<
 }
 
 #[test]
-fn a_message_that_nobody_receives_is_late_in_its_socket() -> Result<()> {
+fn an_unreceived_message_is_late_in_its_socket() -> Result<()> {
     let host = Namespace::alone()?;
     let directory = tempfile::tempdir()?;
     let program = TracedProgram::build(248, &[])?;

@@ -48,7 +48,7 @@ fn a_running_cyclone_dds_robot_repeats_all_names_on_request() -> Result<()> {
 }
 
 #[test]
-fn a_full_disk_costs_only_the_state_and_one_line_in_the_log() -> Result<()> {
+fn a_full_disk_loses_only_the_state_and_logs_one_line() -> Result<()> {
     let scene = Scene::new()?;
     let state = scene.file("state");
     let _disk = Disk::mount(&state)?;

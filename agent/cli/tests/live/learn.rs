@@ -73,7 +73,7 @@ impl<'a> Place<'a> {
 }
 
 #[test]
-fn a_live_robot_is_learnt_without_a_watch_and_its_faults_are_found() -> Result<()> {
+fn expectations_of_a_live_robot_are_learnt_without_a_watch_and_detect_its_faults() -> Result<()> {
     let host = Namespace::alone()?;
     let directory = tempfile::tempdir()?;
     let place = Place::new(&host, directory.path())?;
@@ -180,7 +180,7 @@ fn is_complete(watchlist: &Path) -> Result<()> {
 }
 
 #[test]
-fn an_agent_that_ends_during_rp_learn_leaves_no_watchlist() -> Result<()> {
+fn rp_learn_writes_no_watchlist_if_the_agent_ends() -> Result<()> {
     let host = Namespace::alone()?;
     let directory = tempfile::tempdir()?;
     let mut place = Place::new(&host, directory.path())?;

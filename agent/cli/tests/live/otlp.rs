@@ -60,7 +60,7 @@ fn field(item: &Item, name: &str) -> Result<String> {
 }
 
 #[test]
-fn two_hosts_report_the_same_traces_and_a_stopped_receiver_costs_no_capture() -> Result<()> {
+fn two_hosts_report_the_same_traces_and_a_stopped_receiver_loses_no_capture() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let mut at_robot = Rotel::start(&mut on(&link.robot), directory.path(), None);

@@ -162,7 +162,7 @@ fn counts_on_two_hosts_equal_the_logs_at_either_end() -> Result<()> {
 }
 
 #[test]
-fn segments_that_tcp_sends_again_cost_no_message() -> Result<()> {
+fn segments_retransmitted_by_tcp_lose_no_message() -> Result<()> {
     let mut all_dropped = 0;
     // Packets of up to 64 KB, and packets of one segment.
     for most_segments in [64, 1] {
@@ -375,7 +375,7 @@ fn a_thousand_connections_are_read() -> Result<()> {
 }
 
 #[test]
-fn an_agent_that_comes_second_learns_the_topics_when_another_participant_joins() -> Result<()> {
+fn a_late_agent_discovers_the_topics_when_another_participant_joins() -> Result<()> {
     let host = Namespace::alone()?;
     let [small, ..] = streams(Ipv4Addr::LOCALHOST);
     let stream = Stream {

@@ -379,7 +379,7 @@ fn losses_and_delays_of_peers_are_measured_with_and_without_an_agent() -> Result
 }
 
 #[test]
-fn a_nearly_full_directory_is_a_finding_until_there_is_room() -> Result<()> {
+fn a_nearly_full_directory_is_a_finding_until_space_is_free() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network)?;
     let directory = tempfile::tempdir()?;

@@ -99,7 +99,7 @@ fn counts_on_both_hosts_equal_the_log_of_the_subscription() -> Result<()> {
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_fastrtps_cpp, type_description_interfaces: make test-ros2"]
-fn an_agent_that_starts_last_learns_the_topics_from_a_command() -> Result<()> {
+fn a_late_agent_discovers_the_topics_through_a_command() -> Result<()> {
     let link = Link::new()?;
     let robot = Host::new(&link.robot, Middleware::FastLargeData)?;
     let base = Host::new(&link.monitor, Middleware::FastLargeData)?;

@@ -271,7 +271,7 @@ fn the_service_manager_is_notified_of_start_progress_reload_and_stop() {
 }
 
 #[test]
-fn a_pipe_in_place_of_a_file_is_refused_without_waiting() {
+fn a_pipe_instead_of_a_file_is_refused_without_waiting() {
     let directory = tempfile::tempdir().unwrap();
     let pipe = |name: &str| {
         let path = directory.path().join(name);

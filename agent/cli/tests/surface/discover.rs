@@ -327,12 +327,12 @@ fn participants_with_dds_security_or_without_an_address_are_not_contacted() {
         announces_by_tcp: true,
         ..participant(false, &[])
     };
-    assert_eq!(Target::of(&by_tcp), Err(Refusal::ByTcp));
+    assert_eq!(Target::of(&by_tcp), Err(Refusal::UsesTcp));
     let found = asked(false, &["[::1]:9", there]).unwrap();
     assert_eq!(found, (there.to_owned(), "127.0.0.1:7411".to_owned()));
     let mut asking = participant(false, &[there]);
     asking.guid.prefix = GuidPrefix(*b"\x01\x7fabcdefghij");
-    assert_eq!(Target::of(&asking), Err(Refusal::Asking));
+    assert_eq!(Target::of(&asking), Err(Refusal::OtherDiscover));
 }
 
 proptest! {

@@ -160,7 +160,7 @@ fn violations(capture: &Path, configuration: &Path) -> BTreeMap<String, BTreeSet
 }
 
 #[test]
-fn a_healthy_robot_meets_its_learnt_expectations_and_each_fault_violates_its_topic() {
+fn a_healthy_robot_violates_no_learnt_expectation_and_each_fault_violates_one() {
     let directory = tempfile::tempdir().unwrap();
     let healthy = directory.path().join("healthy.pcap");
     robot(&healthy, &[]);
@@ -206,7 +206,7 @@ fn a_healthy_robot_meets_its_learnt_expectations_and_each_fault_violates_its_top
 }
 
 #[test]
-fn real_robots_meet_their_learnt_expectations() {
+fn real_robots_violate_no_expectation_learnt_from_them() {
     let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../testing/data");
     let directory = tempfile::tempdir().unwrap();
     for capture in [
@@ -338,7 +338,7 @@ fn the_progress_takes_one_line_of_a_terminal() {
 }
 
 #[test]
-fn an_end_time_limits_what_is_learnt_from_a_capture_and_wrong_minutes_are_refused() {
+fn rp_learn_reads_a_capture_up_to_the_end_time_and_refuses_invalid_minutes() {
     let directory = tempfile::tempdir().unwrap();
     let capture = directory.path().join("robot.pcap");
     robot(&capture, &[]);

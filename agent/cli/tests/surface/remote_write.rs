@@ -191,7 +191,7 @@ fn samples_that_a_receiver_cannot_store_yet_come_later_in_order_and_once() {
 }
 
 #[test]
-fn samples_that_a_receiver_refuses_take_no_others_along() {
+fn a_sample_that_a_receiver_refuses_drops_no_other_sample() {
     let directory = tempfile::tempdir().unwrap();
     let receiver = Receiver::start(|_| Reply::status(503));
     let mut agent = sending(&receiver, directory.path(), "");
@@ -387,7 +387,7 @@ fn the_rate_of_bytes_is_limited() {
 }
 
 #[test]
-fn invalid_sections_are_refused_with_their_place() {
+fn invalid_sections_are_refused_with_their_position() {
     let directory = tempfile::tempdir().unwrap();
     let configuration = directory.path().join("ros2probe.yaml");
     let report = |section: &str| {

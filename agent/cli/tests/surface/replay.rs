@@ -45,7 +45,7 @@ fn second(event: &Value) -> f64 {
 }
 
 #[test]
-fn a_replay_stands_still_goes_to_a_time_and_to_the_next_event() {
+fn a_replay_pauses_and_jumps_to_a_time_and_to_the_next_event() {
     let capture = data("cyclonedds/points-besteffort-lossy-2ns");
     let arguments = ["--watch", "/**", "--speed", "0.1"];
     let agent = LocalAgent::replay(&mut rp(), &capture, &arguments);

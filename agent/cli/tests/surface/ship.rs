@@ -337,7 +337,7 @@ fn a_bag_arrives_in_a_folder_with_its_manifest() {
 }
 
 #[test]
-fn a_folder_that_is_not_there_is_not_created() {
+fn a_missing_folder_is_not_created() {
     let folder = tempfile::tempdir().unwrap();
     let missing = folder.path().join("not-mounted");
     let robot = Robot::to(&format!("file://{}", missing.display()), "");

@@ -197,7 +197,7 @@ impl Occurrence {
             _ => false,
         };
         if relieves {
-            definition.relief
+            definition.resolved_severity
         } else {
             definition.severity
         }

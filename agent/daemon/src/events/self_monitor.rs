@@ -25,7 +25,7 @@ pub struct SourceMonitor {
     blind_since: Option<Instant>,
     /// Time of the last successful check. Before the first one, the agent is starting, not blind.
     saw: Option<Instant>,
-    attached_anew: u64,
+    reattachments: u64,
 }
 
 impl DropMonitor {
@@ -65,7 +65,7 @@ fn losses(facts: &AgentFacts) -> Losses {
 
 impl SourceMonitor {
     /// Returns events about changes of visibility at `now`. `ready` has the reason of a failure,
-    /// and `attached_anew` the number of times the hook was attached again. If a control group was
+    /// and `reattachments` the number of times the hook was attached again. If a control group was
     /// recreated between two checks, both events are returned, with the time between the checks.
     pub fn check(
         &mut self,
@@ -73,7 +73,7 @@ impl SourceMonitor {
         attached_anew: u64,
         now: Instant,
     ) -> Vec<AgentEvent> {
-        let is_anew = attached_anew > std::mem::replace(&mut self.attached_anew, attached_anew);
+        let is_anew = attached_anew > std::mem::replace(&mut self.reattachments, attached_anew);
         let mut events = Vec::new();
         match ready {
             Ok(()) => {

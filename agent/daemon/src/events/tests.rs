@@ -160,7 +160,7 @@ fn a_burst_is_limited_each_second_and_summarized_in_one_event() {
 #[test]
 fn a_burst_of_agent_events_is_limited_by_the_clock_of_the_agent() {
     let log = EventLog::new();
-    let at = |seconds| log.begun + Duration::from_secs(seconds);
+    let at = |seconds| log.started + Duration::from_secs(seconds);
     for _ in 0..MAX_EVENTS_PER_SECOND + 3 {
         log.record_at(AgentEvent::Reloaded { watches: 1 }, at(1));
     }
@@ -208,7 +208,7 @@ fn overwritten_events_are_reported_to_the_reader_that_missed_them() {
     assert_eq!(batch.records.len(), KeptEvents::CAP);
     crate::tables::tests::assert_driven::<KeptEvents>();
     assert_eq!(log.read(4000, 1).lagged, 0);
-    log.overtook(Reader::Otlp, lost);
+    log.count_overwritten(Reader::Otlp, lost);
     assert!(log.dropped().contains(&("otlp_lagged", lost)));
     // An impossible position returns no events.
     assert_eq!(log.read(u64::MAX, 1).records.len(), 0);

@@ -211,7 +211,7 @@ impl Unprivileged {
 impl Missing {
     /// Returns a text about the capabilities that each source lacks.
     #[must_use]
-    pub fn needs(&self) -> String {
+    pub fn missing_text(&self) -> String {
         let needs: Vec<String> = self
             .sources
             .iter()
@@ -267,7 +267,7 @@ impl Missing {
     fn in_shell(&self) -> String {
         format!(
             "live capture needs {}: run `{}`, use sudo, or start the service ros2probe",
-            self.needs(),
+            self.missing_text(),
             self.command(),
         )
     }
@@ -289,7 +289,7 @@ impl Missing {
         format!(
             "live capture needs {}: the unit needs `AmbientCapabilities={names}`{more} \
              (`systemctl edit`)",
-            self.needs()
+            self.missing_text()
         )
     }
 }

@@ -70,7 +70,7 @@ pub enum Role {
         /// Whether the kernel requires `CAP_BPF`, as [`Role::inside`] determines.
         needs_bpf: bool,
     },
-    /// The broker, a process of its own with the capabilities that [`uprobe::useful`] returns. It
+    /// The broker, a process of its own with the capabilities that [`uprobe::usable_capabilities`] returns. It
     /// forks, accepts connections, and opens files for reading, but creates no connection.
     Broker,
 }
@@ -170,7 +170,7 @@ impl Role {
             Self::SharedMemory { needs_nice: true } => {
                 CapabilitySet::SYS_PTRACE | CapabilitySet::SYS_NICE
             }
-            Self::Broker => uprobe::useful(),
+            Self::Broker => uprobe::usable_capabilities(),
         }
     }
 }

@@ -26,7 +26,7 @@ pub struct SnapshotFigures {
     /// Memory used by the messages, in bytes.
     pub bytes: u64,
     /// Messages evicted before the end of the time span, for lack of memory.
-    pub crowded_out: u64,
+    pub evicted: u64,
     /// Bags written.
     pub written: u64,
     /// Bags that could not be written.

@@ -161,7 +161,7 @@ impl<'a> Recorder<'a> {
 
     /// Keeps the last samples in memory, and writes them on [`Self::snapshot`].
     #[must_use]
-    pub fn waiting_in(self, ring: SampleRing) -> Self {
+    pub fn with_ring(self, ring: SampleRing) -> Self {
         Self {
             ring: Some(ring),
             ..self
@@ -170,7 +170,7 @@ impl<'a> Recorder<'a> {
 
     /// Makes the recording end with an error when the quota is exhausted.
     #[must_use]
-    pub fn within(self, quota: DiskQuota) -> Self {
+    pub fn with_quota(self, quota: DiskQuota) -> Self {
         Self {
             quota: Some(quota),
             ..self
@@ -197,11 +197,11 @@ impl<'a> Recorder<'a> {
     }
 
     /// Returns the selected and published topics of `graph` that have no message yet for a known
-    /// reason. The values are the reasons, as in [`Report::unobserved`].
+    /// reason. The values are the reasons, as in [`Report::unobserved_topics`].
     #[must_use]
-    pub fn unobserved(&self, graph: &GraphSnapshot) -> BTreeMap<String, String> {
+    pub fn unobserved_topics(&self, graph: &GraphSnapshot) -> BTreeMap<String, String> {
         let topics = graph.topics.iter();
-        let topics = topics.filter(|topic| topic.domain_id == self.domain_id && self.takes(topic));
+        let topics = topics.filter(|topic| topic.domain_id == self.domain_id && self.is_selected(topic));
         let topics = topics.filter_map(|topic| {
             let recorded = self.report.topics.get(&topic.name);
             if recorded.is_some_and(|topic| topic.messages > 0 || topic.paused > 0) {
@@ -230,8 +230,8 @@ impl<'a> Recorder<'a> {
 
     /// Returns whether this topic would be recorded, regardless of its domain.
     #[must_use]
-    pub fn takes(&self, topic: &PublishedTopic) -> bool {
-        self.filter.takes(&Candidate {
+    pub fn is_selected(&self, topic: &PublishedTopic) -> bool {
+        self.filter.is_selected(&Candidate {
             name: &topic.name,
             types: &topic.message_types,
             published: true,
@@ -307,7 +307,7 @@ impl<'a> Recorder<'a> {
             let place = self.decide(name, message_type, None, &announced, false)?;
             // Other topics are decided again later, since they may be published or fit by then.
             if matches!(place, TopicDecision::Recorded(_)) {
-                self.keep(name, place);
+                self.store_decision(name, place);
             }
         }
         Ok(())
@@ -462,7 +462,7 @@ impl<'a> Recorder<'a> {
                 self.report.no_room += messages;
                 return Ok(None);
             }
-            self.keep(name, place);
+            self.store_decision(name, place);
         }
         let Some(TopicDecision::Recorded(taken)) = self.topics.get_mut(&**name) else {
             return Ok(None);
@@ -484,7 +484,7 @@ impl<'a> Recorder<'a> {
 
     /// Stores the decision about a topic. Excluded topics take at most half of the table; beyond
     /// that, they are decided again each time.
-    fn keep(&mut self, name: &str, place: TopicDecision) {
+    fn store_decision(&mut self, name: &str, place: TopicDecision) {
         let bytes = match &place {
             TopicDecision::Recorded(taken) => name.len() + taken.description.type_name.len(),
             TopicDecision::Excluded | TopicDecision::NoRoom => name.len(),
@@ -535,7 +535,7 @@ impl<'a> Recorder<'a> {
             published: came || !announced.publishers.is_empty(),
             subscribed: announced.subscribed,
         };
-        if !self.filter.takes(&candidate) {
+        if !self.filter.is_selected(&candidate) {
             return Ok(TopicDecision::Excluded);
         }
         if self.topics.is_full() {

@@ -92,7 +92,7 @@ pub struct Run {
     /// Time of the latest snapshot, and the revision of the graph in it.
     taken: Option<(Instant, u64)>,
     stop: CancellationToken,
-    keeper: Option<StateWriter>,
+    state_writer: Option<StateWriter>,
     history: Option<History>,
 }
 
@@ -138,20 +138,20 @@ impl Run {
             published_until: Timestamp::default(),
             taken: None,
             stop,
-            keeper: None,
+            state_writer: None,
             history: None,
         }
     }
 
     /// Saves the discovery state for the next start.
     #[must_use]
-    pub fn keeping(self, keeper: Option<StateWriter>) -> Self {
-        Self { keeper, ..self }
+    pub fn with_state_writer(self, keeper: Option<StateWriter>) -> Self {
+        Self { state_writer: keeper, ..self }
     }
 
     /// Keeps the measurements of the last seconds.
     #[must_use]
-    pub fn remembering(self, history: Option<History>) -> Self {
+    pub fn with_history(self, history: Option<History>) -> Self {
         Self { history, ..self }
     }
 
@@ -161,19 +161,19 @@ impl Run {
     ///
     /// Fails if the source fails permanently.
     pub fn run(mut self) -> Result<(), RunError> {
-        let ended = self.work();
+        let ended = self.run_source();
         self.subscriptions.end(match &ended {
             Ok(()) if self.source.is_finished() => "end of capture",
             Ok(()) => "agent ends",
             Err(_) => "the capture failed",
         });
-        if let Some(keeper) = self.keeper.take() {
+        if let Some(keeper) = self.state_writer.take() {
             keeper.finish(self.observer.memory());
         }
         ended
     }
 
-    fn work(&mut self) -> Result<(), RunError> {
+    fn run_source(&mut self) -> Result<(), RunError> {
         let has_applied_lists = self.take_watches();
         self.hand_over();
         if has_applied_lists {
@@ -193,7 +193,7 @@ impl Run {
             } else {
                 self.idle_slice()
             };
-            let pace = self.follow_pace();
+            let pace = self.apply_pace();
             let step = self.step(subscribed);
             let bell = self.outputs.latest.bell().descriptor();
             let polled = self.source.poll(slice, step, bell, &mut self.observer);
@@ -208,7 +208,7 @@ impl Run {
             } else {
                 self.observer.input(Input::Time(self.source.clock()));
             }
-            self.remember();
+            self.store_history();
             let has_event = self.hand_over();
             if has_applied_lists {
                 self.confirm_requests();
@@ -253,7 +253,7 @@ impl Run {
     }
 
     /// Makes a replay go on as clients request it, and returns what they request.
-    fn follow_pace(&mut self) -> Pace {
+    fn apply_pace(&mut self) -> Pace {
         let pace = self.outputs.latest.replay_pace().get();
         if let Source::Replay(replay) = &mut self.source {
             replay.follow(&pace);
@@ -267,8 +267,8 @@ impl Run {
             return false;
         };
         let has_arrived = match followed.jump {
-            Some(Jump::To(_)) => replay.has_arrived(),
-            Some(Jump::NextEvent) => has_event || replay.has_arrived(),
+            Some(Jump::To(_)) => replay.has_reached_target(),
+            Some(Jump::NextEvent) => has_event || replay.has_reached_target(),
             None => false,
         };
         if has_arrived {
@@ -308,7 +308,7 @@ impl Run {
     }
 
     /// Stores the measurements of the last second.
-    fn remember(&mut self) {
+    fn store_history(&mut self) {
         let now = self.source.clock();
         let Some(history) = self.history.as_mut().filter(|history| history.is_due(now)) else {
             return;
@@ -316,7 +316,7 @@ impl Run {
         history.take(now, self.observer.measured(now));
         let latest = &self.outputs.latest;
         // Ten minutes of history are a list of 600 seconds, which may have no reader.
-        if latest.wants_past() || !matches!(self.source, Source::Live(_)) {
+        if latest.is_history_requested() || !matches!(self.source, Source::Live(_)) {
             latest.publish_past(history.past());
         }
     }
@@ -329,7 +329,7 @@ impl Run {
         if let Source::Live(live) = &mut self.source {
             live.apply(&output.interest);
             let now = Instant::now();
-            live.want_inside(self.outputs.latest.are_calls_wanted(now));
+            live.want_inside(self.outputs.latest.are_calls_requested(now));
             let mut demand = self.outputs.latest.late_demand(now);
             self.causes.note(&output.events.events, now);
             self.causes.add_to(&mut demand, now);
@@ -389,7 +389,7 @@ impl Run {
     fn confirm_requests(&mut self) {
         if let Some(sample_requests) = self.sample_requests.take() {
             let observer = &mut self.observer;
-            (self.subscriptions).in_force(&sample_requests, |request| observer.latched(request));
+            (self.subscriptions).confirm_applied(&sample_requests, |request| observer.latched(request));
             self.unconfirmed = Some((Arc::clone(&sample_requests), Instant::now()));
             if sample_requests.is_empty() {
                 // Buffers of large messages are free now, and the next subscription may begin much
@@ -466,7 +466,7 @@ impl Run {
     /// Returns whether the latest snapshot was read since the last call, or no longer describes the
     /// graph.
     fn is_snapshot_due(&self) -> bool {
-        let was_read = self.outputs.latest.was_read();
+        let was_read = self.outputs.latest.was_snapshot_read();
         let is_current = self.taken.is_some_and(|(at, revision)| {
             at.elapsed() < UNREAD_PUBLISH_INTERVAL && revision == self.observer.memory_revision()
         });
@@ -480,9 +480,9 @@ impl Run {
         facts.replay_pace = self.outputs.latest.replay_pace().get();
         facts.subscriptions = self.subscriptions.facts();
         facts.subscriptions.retained_bytes = self.observer.latched_bytes();
-        if let Some(keeper) = &mut self.keeper {
+        if let Some(keeper) = &mut self.state_writer {
             let (revision, now) = (self.observer.memory_revision(), Instant::now());
-            if keeper.wants(revision, now) {
+            if keeper.is_write_due(revision, now) {
                 keeper.keep(self.observer.memory(), revision, now);
             }
             let state = keeper.facts();

@@ -165,7 +165,7 @@ fn a_partial_file_of_a_killed_agent_is_ignored_and_removed() {
 }
 
 #[test]
-fn a_link_in_place_of_a_state_file_is_neither_read_nor_written_through() {
+fn a_symbolic_link_instead_of_a_state_file_is_neither_read_nor_written() {
     let (place, directory) = directory();
     let elsewhere = tempfile::tempdir().unwrap();
     let target = elsewhere.path().join("target");
@@ -188,7 +188,7 @@ fn a_link_in_place_of_a_state_file_is_neither_read_nor_written_through() {
 }
 
 #[test]
-fn a_pipe_or_a_directory_in_place_of_a_state_file_does_not_block_the_start() {
+fn a_pipe_or_directory_instead_of_a_state_file_does_not_block_the_start() {
     let (place, directory) = directory();
     let path = place.path().join(STATE_FILE);
     mknodat(CWD, &path, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0).unwrap();
@@ -221,20 +221,20 @@ fn a_failed_write_of_the_state_is_counted_and_retried() {
     fs::create_dir(&obstacle).unwrap();
     let mut keeper = StateWriter::start(Arc::new(directory)).unwrap();
     let start = Instant::now();
-    assert!(keeper.wants(0, start));
+    assert!(keeper.is_write_due(0, start));
     keeper.keep(Memory::default(), 0, start);
     while keeper.facts().failures == 0 {
         assert!(start.elapsed() < Duration::from_secs(10));
         std::thread::yield_now();
     }
     fs::remove_dir(obstacle).unwrap();
-    assert!(!keeper.wants(0, start + 2 * WRITE_INTERVAL), "nothing has changed");
+    assert!(!keeper.is_write_due(0, start + 2 * WRITE_INTERVAL), "nothing has changed");
     assert!(
-        keeper.wants(0, start + RETRY_INTERVAL),
+        keeper.is_write_due(0, start + RETRY_INTERVAL),
         "there may be room again"
     );
-    assert!(!keeper.wants(1, start + WRITE_INTERVAL / 2), "it is too soon");
-    assert!(keeper.wants(1, start + WRITE_INTERVAL));
+    assert!(!keeper.is_write_due(1, start + WRITE_INTERVAL / 2), "it is too soon");
+    assert!(keeper.is_write_due(1, start + WRITE_INTERVAL));
     assert_eq!(keeper.facts().writes, 0);
     keeper.finish(Memory::default());
     let directory = StateDirectory::open(place.path()).unwrap();

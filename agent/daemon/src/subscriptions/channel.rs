@@ -35,7 +35,7 @@ pub(super) struct Channel {
     /// Notification of asynchronous and of blocking readers.
     readable: Notify,
     changed: Condvar,
-    in_force: AtomicBool,
+    is_applied: AtomicBool,
     known: Notify,
 }
 
@@ -112,7 +112,7 @@ impl Channel {
             bytes: AtomicUsize::new(0),
             readable: Notify::new(),
             changed: Condvar::new(),
-            in_force: AtomicBool::new(false),
+            is_applied: AtomicBool::new(false),
             known: Notify::new(),
         }
     }
@@ -155,22 +155,22 @@ impl Channel {
         }
     }
 
-    /// Removes and returns the topics whose retained samples are due, if `in_force` is the latest
+    /// Removes and returns the topics whose retained samples are due, if `wait_applied` is the latest
     /// selection.
-    pub(super) fn take_fresh(&self, in_force: &Arc<Selection>) -> Option<Arc<Selection>> {
+    pub(super) fn take_newly_selected(&self, in_force: &Arc<Selection>) -> Option<Arc<Selection>> {
         let mut wanted = self.wanted();
         let is_latest = Arc::ptr_eq(&wanted.selection, in_force);
         is_latest.then(|| wanted.fresh.take()).flatten()
     }
 
     pub(super) fn set_in_force(&self) {
-        if !self.in_force.swap(true, Ordering::Release) {
+        if !self.is_applied.swap(true, Ordering::Release) {
             self.known.notify_one();
         }
     }
 
-    pub(super) async fn in_force(&self) {
-        if !self.in_force.load(Ordering::Acquire) {
+    pub(super) async fn wait_applied(&self) {
+        if !self.is_applied.load(Ordering::Acquire) {
             self.known.notified().await;
         }
     }
@@ -338,7 +338,7 @@ impl Channel {
 
     /// Evicts an entry. Returns `false` if the queue is empty.
     fn drop_one(&self, queue: &mut Queue) -> bool {
-        let Some(item) = queue.waiting.sacrifice() else {
+        let Some(item) = queue.waiting.evict_least_important() else {
             return false;
         };
         self.bytes.store(queue.waiting.bytes(), Ordering::Relaxed);

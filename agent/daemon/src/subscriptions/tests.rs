@@ -95,7 +95,7 @@ fn each_reader_gets_its_samples_and_payloads_only_on_request() {
     assert_eq!(payloads.try_next(), Some(Item::Sample(sample(1, Some(5)))));
     assert_eq!(all.facts().queued_bytes, 6);
     assert_eq!(payloads.try_next(), Some(Item::Sample(sample(2, Some(6)))));
-    assert_eq!((all.facts().queued_bytes, all.facts().given), (0, 3));
+    assert_eq!((all.facts().queued_bytes, all.facts().enqueued), (0, 3));
 }
 
 #[test]
@@ -296,14 +296,14 @@ fn patterns_of_all_subscriptions_together_are_bounded() {
 }
 
 #[tokio::test]
-async fn a_reader_receives_its_items_then_the_end_and_then_none() {
+async fn a_reader_receives_its_items_and_then_the_end() {
     let all = subscriptions(caps());
     let mut reader = all
         .open(request(Depth::Arrivals, 1 << 16, Overflow::DropOldest))
         .unwrap();
     assert!(!reader.in_force(Duration::from_millis(1)).await);
     let requests = all.take_changed().unwrap();
-    all.in_force(&requests, |_| Vec::new());
+    all.confirm_applied(&requests, |_| Vec::new());
     assert!(!reader.in_force(Duration::from_millis(1)).await);
     all.confirm(&requests);
     assert!(reader.in_force(LONG).await);

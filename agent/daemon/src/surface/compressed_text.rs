@@ -70,7 +70,7 @@ impl TextCompressor {
                 Form::Plain(rest) => rest.extend_from_slice(part),
                 Form::Gzip(encoder) => encoder.write_all(part)?,
             }
-            self.pack(PIECE_BYTES);
+            self.compress_piece(PIECE_BYTES);
         }
         Ok(())
     }
@@ -87,7 +87,7 @@ impl TextCompressor {
                 Encoding::Gzip
             }
         };
-        self.pack(1);
+        self.compress_piece(1);
         Ok(CompressedText {
             encoding,
             pieces: self.pieces,
@@ -96,7 +96,7 @@ impl TextCompressor {
     }
 
     /// Completes a piece if at least this many bytes are pending.
-    fn pack(&mut self, least: usize) {
+    fn compress_piece(&mut self, least: usize) {
         let rest = match &mut self.form {
             Form::Plain(rest) => rest,
             Form::Gzip(encoder) => encoder.get_mut(),

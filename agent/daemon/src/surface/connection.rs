@@ -37,7 +37,7 @@ const UNCHARGED_BYTES: usize = 4 << 10;
 pub(super) struct Connections {
     connections: Mutex<Vec<Arc<ConnectionState>>>,
     unfinished: AtomicUsize,
-    left: Notify,
+    closed: Notify,
 }
 
 /// Progress of one connection; shared by its stream and its request handler.
@@ -129,19 +129,19 @@ impl Connections {
     }
 
     /// Waits until a connection has been closed.
-    pub(super) async fn left(&self) {
-        self.left.notified().await;
+    pub(super) async fn wait_closed(&self) {
+        self.closed.notified().await;
     }
 
     /// Counts bytes of an unfinished request; returns false if they exceed the limit.
-    fn hold(&self, bytes: usize) -> bool {
+    fn charge(&self, bytes: usize) -> bool {
         let more = |held: usize| Some(held + bytes).filter(|held| *held <= MAX_UNFINISHED_BYTES);
         let unfinished = &self.unfinished;
         let held = unfinished.fetch_update(Ordering::Relaxed, Ordering::Relaxed, more);
         held.is_ok()
     }
 
-    fn release(&self, bytes: usize) {
+    fn discharge(&self, bytes: usize) {
         self.unfinished.fetch_sub(bytes, Ordering::Relaxed);
     }
 
@@ -171,7 +171,7 @@ impl ConnectionState {
     pub(super) fn requested(&self, is_whole: bool) {
         let mut progress = self.lock();
         if is_whole {
-            progress.enter(Phase::Working);
+            progress.set_phase(Phase::Working);
         } else {
             // Head and body share one time limit.
             progress.phase = Phase::Receiving;
@@ -182,23 +182,23 @@ impl ConnectionState {
     pub(super) fn received(&self) {
         let mut progress = self.lock();
         if progress.phase == Phase::Receiving {
-            progress.enter(Phase::Working);
+            progress.set_phase(Phase::Working);
         }
     }
 
     /// Records that the answer begins. It is a stream unless `is_whole`.
-    pub(super) fn answers(&self, is_whole: bool) {
+    pub(super) fn begin_answer(&self, is_whole: bool) {
         let phase = if is_whole {
             Phase::Answering
         } else {
             Phase::Streaming
         };
-        self.lock().enter(phase);
+        self.lock().set_phase(phase);
     }
 
     /// Records that the HTTP server has finished with the answer.
     pub(super) fn answered(&self) {
-        self.lock().enter(Phase::Waiting);
+        self.lock().set_phase(Phase::Waiting);
     }
 
     /// Returns whether no request is in progress.
@@ -218,7 +218,7 @@ impl ConnectionState {
 }
 
 impl Progress {
-    fn enter(&mut self, phase: Phase) {
+    fn set_phase(&mut self, phase: Phase) {
         self.phase = phase;
         self.since = Instant::now();
         if phase == Phase::Waiting {
@@ -251,7 +251,7 @@ impl<S> Connection<S> {
     }
 
     /// Returns an error after the deadline, otherwise `Pending`.
-    fn overdue<T>(&mut self, context: &mut Context<'_>) -> Poll<io::Result<T>> {
+    fn poll_deadline<T>(&mut self, context: &mut Context<'_>) -> Poll<io::Result<T>> {
         let deadline = self.state.lock().deadline();
         if self.deadline.deadline() != deadline {
             self.deadline.as_mut().reset(deadline);
@@ -276,7 +276,7 @@ impl<S> Connection<S> {
         progress.was_empty = false;
         let beyond = progress.read.saturating_sub(UNCHARGED_BYTES);
         let fresh = beyond.saturating_sub(progress.counted);
-        if !self.connections.hold(fresh) {
+        if !self.connections.charge(fresh) {
             return Err(io::Error::other("too many bytes of unfinished requests"));
         }
         progress.counted += fresh;
@@ -290,7 +290,7 @@ impl<S> Connection<S> {
         let mut progress = self.state.lock();
         // The request has been processed.
         self.connections
-            .release(std::mem::take(&mut progress.counted));
+            .discharge(std::mem::take(&mut progress.counted));
         if matches!(progress.phase, Phase::Answering | Phase::Streaming) {
             progress.since = now;
         }
@@ -305,7 +305,7 @@ impl<S> Connection<S> {
         }
     }
 
-    fn stalls(&self) {
+    fn note_stall(&self) {
         let mut progress = self.state.lock();
         if progress.stalled.is_none() {
             progress.stalled = Some((Instant::now(), 0));
@@ -315,13 +315,13 @@ impl<S> Connection<S> {
 
 impl<S> Drop for Connection<S> {
     fn drop(&mut self) {
-        self.connections.release(self.state.lock().counted);
+        self.connections.discharge(self.state.lock().counted);
         let mut connections = self.connections.lock();
         connections.retain(|state| !Arc::ptr_eq(state, &self.state));
         drop(connections);
         // A waiting client finds the slot free.
         self.slot = None;
-        self.connections.left.notify_one();
+        self.connections.closed.notify_one();
     }
 }
 
@@ -335,7 +335,7 @@ impl<S: AsyncRead + Unpin> AsyncRead for Connection<S> {
         match Pin::new(&mut self.stream).poll_read(context, buffer) {
             Poll::Pending => {
                 self.state.lock().was_empty = true;
-                self.overdue(context)
+                self.poll_deadline(context)
             }
             Poll::Ready(Ok(())) => {
                 let bytes = buffer.filled().len().saturating_sub(before);
@@ -354,8 +354,8 @@ impl<S: AsyncWrite + Unpin> AsyncWrite for Connection<S> {
     ) -> Poll<io::Result<usize>> {
         match Pin::new(&mut self.stream).poll_write(context, bytes) {
             Poll::Pending => {
-                self.stalls();
-                self.overdue(context)
+                self.note_stall();
+                self.poll_deadline(context)
             }
             Poll::Ready(Ok(written)) => {
                 self.has_written(written);
@@ -442,7 +442,7 @@ mod tests {
             let (_crowd, join) = connections();
             let (mut connection, mut client) = join();
             connection.state().requested(true);
-            connection.state().answers(is_whole);
+            connection.state().begin_answer(is_whole);
             let start = Instant::now();
             let sent = connection.write_all(&[7; 1 << 20]);
             // The client reads 5 KB per second of a complete answer, and nothing of a stream.
@@ -470,7 +470,7 @@ mod tests {
         let (_crowd, join) = connections();
         let (mut connection, mut client) = join();
         connection.state().requested(true);
-        connection.state().answers(true);
+        connection.state().begin_answer(true);
         let reading = tokio::spawn(async move {
             let mut bytes = [0; 2 << 10];
             let mut read = 0;
@@ -490,7 +490,7 @@ mod tests {
         let (_crowd, join) = connections();
         let (mut connection, mut client) = join();
         connection.state().requested(true);
-        connection.state().answers(true);
+        connection.state().begin_answer(true);
         for _ in 0..3 {
             let stopped = connection.write_all(&[7; 2 << 10]).now_or_never();
             assert!(stopped.is_none(), "the buffer is full");
@@ -502,7 +502,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn large_unfinished_requests_share_a_budget_and_small_ones_need_none() {
+    async fn large_unfinished_requests_share_a_budget_and_small_ones_are_exempt() {
         let (connections, join) = connections();
         let mut large = Vec::new();
         let mut refused = 0;

@@ -211,7 +211,7 @@ async fn metrics(Extract(pages): Extract<Pages>, headers: HeaderMap) -> Response
     let format = Format::negotiate(&accepts.join(","));
     let encoding = encoding(&headers);
     pages.latest.refresh(REFRESH_TIMEOUT).await;
-    let Some(turn) = METRICS_RESPONSES.turn().await else {
+    let Some(turn) = METRICS_RESPONSES.permit().await else {
         pages.limits.reached(Limit::MetricsClients, 1);
         let reason = "too many pages are being rendered
 ";
@@ -234,7 +234,7 @@ async fn metrics(Extract(pages): Extract<Pages>, headers: HeaderMap) -> Response
             (VARY, "accept, accept-encoding"),
         ],
         [(CONTENT_LENGTH, page.len())],
-        turn.keep_packed(page),
+        turn.compressed_body(page),
     )
         .into_response();
     if encoding == Encoding::Gzip {

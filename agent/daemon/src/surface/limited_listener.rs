@@ -38,7 +38,7 @@ pub(super) struct LimitedListener<L> {
     limits: Arc<LimitFigures>,
     limit: Limit,
     refusal: Option<Refusal>,
-    leaving: JoinSet<()>,
+    refusals: JoinSet<()>,
 }
 
 /// The answer to connections beyond the limit.
@@ -61,7 +61,7 @@ impl<L> LimitedListener<L> {
             limits,
             limit,
             refusal,
-            leaving: JoinSet::new(),
+            refusals: JoinSet::new(),
         }
     }
 
@@ -86,7 +86,7 @@ impl<L> LimitedListener<L> {
                 if let Some(slot) = self.slots.take() {
                     return slot;
                 }
-                self.connections.left().await;
+                self.connections.wait_closed().await;
             }
         };
         match timeout(SEARCH_TIMEOUT, evicted).await {
@@ -99,11 +99,11 @@ impl<L> LimitedListener<L> {
     /// Refuses a connection without a slot, in the background. The number of such answers in
     /// progress is limited.
     fn reject(&mut self, stream: impl AsyncRead + AsyncWrite + Unpin + Send + 'static) {
-        while self.leaving.try_join_next().is_some() {}
+        while self.refusals.try_join_next().is_some() {}
         if let Some(refusal) = self.refusal.clone()
-            && self.leaving.len() < MAX_REFUSALS
+            && self.refusals.len() < MAX_REFUSALS
         {
-            self.leaving.spawn(async move {
+            self.refusals.spawn(async move {
                 let _ = timeout(REFUSAL_TIMEOUT, refusal.send(stream)).await;
             });
         }

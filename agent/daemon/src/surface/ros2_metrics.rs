@@ -518,8 +518,8 @@ fn topic_info(family: &mut Family<'_>, row: &TopicRow<'_>) -> fmt::Result {
         &facts.publishers
     };
     let policies =
-        |policy: fn(&EndpointFacts) -> &'static str| joined(endpoints.iter().map(policy));
-    let message_types = joined(facts.message_types.iter().map(TypeName::as_str));
+        |policy: fn(&EndpointFacts) -> &'static str| join_values(endpoints.iter().map(policy));
+    let message_types = join_values(facts.message_types.iter().map(TypeName::as_str));
     let reliability = policies(|endpoint| endpoint.qos.reliability.label());
     let durability = policies(|endpoint| endpoint.qos.durability.label());
     family.info(&[
@@ -533,7 +533,7 @@ fn topic_info(family: &mut Family<'_>, row: &TopicRow<'_>) -> fmt::Result {
 }
 
 /// Joins the different values, sorted, up to [`MAX_JOINED`].
-fn joined<'a>(values: impl Iterator<Item = &'a str>) -> String {
+fn join_values<'a>(values: impl Iterator<Item = &'a str>) -> String {
     let different: BTreeSet<&str> = values.collect();
     let mut text = String::new();
     for value in different.iter().take(MAX_JOINED) {

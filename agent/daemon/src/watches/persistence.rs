@@ -128,7 +128,7 @@ pub fn load(directory: &StateDirectory) -> LoadedWatches {
     });
     match watches {
         Ok(watches) => LoadedWatches::These(watches),
-        Err(error) => match directory.set_aside::<Document>(WATCHES_FILE, error.to_string()) {
+        Err(error) => match directory.move_aside::<Document>(WATCHES_FILE, error.to_string()) {
             Found::Unusable { reason, moved_to } => LoadedWatches::Unusable { reason, moved_to },
             Found::Nothing | Found::This(_) | Found::Newer(_) => LoadedWatches::Nothing,
         },
@@ -228,13 +228,13 @@ impl WatchWriter {
     }
 
     /// Passes the list to the writing thread, without blocking.
-    pub(super) fn keep(&self, watches: Vec<Arc<Watch>>) {
+    pub(super) fn store(&self, watches: Vec<Arc<Watch>>) {
         self.mailbox.pending().latest = Some(watches);
         self.mailbox.changed.notify_one();
     }
 
     /// Returns whether the last write succeeded, and the current one takes no longer than usual.
-    pub(super) fn works(&self) -> bool {
+    pub(super) fn is_working(&self) -> bool {
         !self.mailbox.pending().is_failing && self.mailbox.progress.stalled().is_none()
     }
 
@@ -264,7 +264,7 @@ impl Mailbox {
             };
             self.progress.step();
             let written = directory.replace(WATCHES_FILE, &document);
-            self.progress.rest();
+            self.progress.set_idle();
             let mut pending = self.pending();
             let failed_before = mem::replace(&mut pending.is_failing, written.is_err());
             // At the end, a failed write is not retried.
@@ -341,8 +341,8 @@ mod tests {
         let (_place, directory) = directory();
         assert_eq!(load(&directory), LoadedWatches::Nothing);
         let keeper = WatchWriter::start(Arc::clone(&directory)).unwrap();
-        keeper.keep(Vec::new());
-        keeper.keep(shared());
+        keeper.store(Vec::new());
+        keeper.store(shared());
         keeper.finish();
         assert_eq!(load(&directory), LoadedWatches::These(watches()));
     }
@@ -435,9 +435,9 @@ mod tests {
         let obstacle = place.path().join("watches.json.new");
         fs::create_dir(&obstacle).unwrap();
         let keeper = WatchWriter::start(Arc::clone(&directory)).unwrap();
-        keeper.keep(shared());
+        keeper.store(shared());
         let start = Instant::now();
-        while keeper.works() {
+        while keeper.is_working() {
             assert!(start.elapsed() < Duration::from_secs(10));
             std::thread::yield_now();
         }

@@ -192,7 +192,7 @@ fn a_response_that_is_truncated_or_changed_anywhere_causes_no_panic() {
 }
 
 #[test]
-fn counts_beyond_the_bytes_are_refused_before_memory_is_taken() {
+fn counts_beyond_the_bytes_are_refused_before_memory_is_allocated() {
     let payload = thing().payload();
     // Lengths of lists with one entry, and of empty strings. The first word is `successful`.
     let huge: Vec<_> = (8..payload.len() - 4)

@@ -38,7 +38,7 @@ pub(super) trait Queue {
     type Batch;
 
     /// Completes once the queue has items.
-    async fn filled(&self);
+    async fn wait_filled(&self);
 
     /// Returns the oldest items, or `None` without any, and the number of items that did not fit.
     fn take(&mut self) -> (Option<Self::Batch>, u64);
@@ -52,12 +52,12 @@ pub(super) struct Delivery<E> {
     exports: Arc<Exports>,
     stop: CancellationToken,
     /// Whether the last request succeeded; `None` before the first.
-    works: Option<bool>,
+    is_working: Option<bool>,
 }
 
 /// Result of the delivery of a batch.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Settled {
+pub(super) enum BatchResult {
     /// The receiver accepted or refused it.
     Answered,
     /// Newer points replace it. It is counted as dropped.
@@ -81,12 +81,12 @@ impl<E: Export> Delivery<E> {
             endpoint,
             exports,
             stop,
-            works: None,
+            is_working: None,
         }
     }
 
     /// Completes when the agent stops.
-    pub(super) async fn stopped(&self) {
+    pub(super) async fn wait_stopped(&self) {
         self.stop.cancelled().await;
     }
 
@@ -101,15 +101,15 @@ impl<E: Export> Delivery<E> {
         let mut left = Vec::new();
         while left.is_empty() {
             let gathered = async {
-                queue.filled().await;
+                queue.wait_filled().await;
                 sleep(gather).await;
             };
             tokio::select! {
                 () = gathered => {}
-                () = self.stopped() => break,
+                () = self.wait_stopped() => break,
             }
             while let Some(batch) = self.next(&mut queue) {
-                if self.deliver(&batch, None).await == Settled::Stopped {
+                if self.deliver(&batch, None).await == BatchResult::Stopped {
                     left.push(batch);
                     break;
                 }
@@ -126,25 +126,25 @@ impl<E: Export> Delivery<E> {
     }
 
     /// Delivers a batch until it is answered, until `newer`, or until the agent stops.
-    pub(super) async fn deliver(&mut self, batch: &E::Batch, newer: Option<Instant>) -> Settled {
+    pub(super) async fn deliver(&mut self, batch: &E::Batch, newer: Option<Instant>) -> BatchResult {
         let stop = self.stop.clone();
         let settled = {
             let offers = async {
                 let Some(newer) = newer else {
-                    self.offer(batch).await;
-                    return Settled::Answered;
+                    self.send_until_settled(batch).await;
+                    return BatchResult::Answered;
                 };
-                match timeout_at(newer, self.offer(batch)).await {
-                    Ok(()) => Settled::Answered,
-                    Err(_) => Settled::Overtaken,
+                match timeout_at(newer, self.send_until_settled(batch)).await {
+                    Ok(()) => BatchResult::Answered,
+                    Err(_) => BatchResult::Overtaken,
                 }
             };
             tokio::select! {
                 settled = offers => settled,
-                () = stop.cancelled() => Settled::Stopped,
+                () = stop.cancelled() => BatchResult::Stopped,
             }
         };
-        if settled == Settled::Overtaken {
+        if settled == BatchResult::Overtaken {
             self.failed("no answer before the next export");
             self.count(Outcome::Failed);
             self.superseded(batch);
@@ -175,7 +175,7 @@ impl<E: Export> Delivery<E> {
     }
 
     /// Offers a batch until the receiver accepts or refuses it.
-    async fn offer(&mut self, batch: &E::Batch) {
+    async fn send_until_settled(&mut self, batch: &E::Batch) {
         let (mut pause, mut is_again) = (FIRST_RETRY_DELAY, false);
         while let Err((error, is_refused)) = self.send(batch, is_again).await {
             self.failed(&error);
@@ -211,8 +211,8 @@ impl<E: Export> Delivery<E> {
     }
 
     fn delivered(&mut self, rejected: u64) {
-        if self.works != Some(true) {
-            self.works = Some(true);
+        if self.is_working != Some(true) {
+            self.is_working = Some(true);
             tracing::info!(
                 signal = self.signal.label(),
                 endpoint = self.endpoint,
@@ -229,8 +229,8 @@ impl<E: Export> Delivery<E> {
 
     /// Logs the first failure until a request succeeds again.
     fn failed(&mut self, reason: &str) {
-        if self.works != Some(false) {
-            self.works = Some(false);
+        if self.is_working != Some(false) {
+            self.is_working = Some(false);
             tracing::warn!(
                 signal = self.signal.label(),
                 endpoint = self.endpoint,

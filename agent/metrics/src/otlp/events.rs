@@ -83,7 +83,7 @@ impl Reporter {
 impl Queue for Reporter {
     type Batch = Vec<SdkLogRecord>;
 
-    async fn filled(&self) {
+    async fn wait_filled(&self) {
         self.log.wait_after(self.place).await;
     }
 

@@ -64,8 +64,8 @@ pub(super) struct NodeLogs {
 impl Queue for NodeLogs {
     type Batch = Vec<SdkLogRecord>;
 
-    async fn filled(&self) {
-        self.queue.0.filled().await;
+    async fn wait_filled(&self) {
+        self.queue.0.wait_filled().await;
     }
 
     /// The sink counts messages that do not fit.
@@ -176,7 +176,7 @@ mod tests {
     }
 
     #[test]
-    fn a_record_has_severity_place_times_and_trace_of_its_message() {
+    fn a_log_record_has_severity_location_times_and_trace_of_its_message() {
         let logs = NodeLogs::new(Arc::default());
         let record = logs.record(&new_log(LogLevel::Fatal));
         let logged = SystemTime::UNIX_EPOCH + Duration::new(1_700_000_000, 5);

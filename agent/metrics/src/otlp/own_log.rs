@@ -100,7 +100,7 @@ impl LogQueue {
 impl Queue for &LogQueue {
     type Batch = Vec<SdkLogRecord>;
 
-    async fn filled(&self) {
+    async fn wait_filled(&self) {
         LogQueue::filled(self).await;
     }
 

@@ -91,7 +91,7 @@ impl SpanSink {
         let calls = late.calls.iter();
         let refused = calls.map(|(domain_id, example)| {
             let spans = LateSpan::of(*domain_id, example).into_iter();
-            self.queue.0.put_whole(spans.map(QueuedSpan::LateCall))
+            self.queue.0.add_all_or_none(spans.map(QueuedSpan::LateCall))
         });
         late.lost + refused.sum::<u64>()
     }
@@ -123,8 +123,8 @@ pub(super) struct Tracing {
 impl Queue for Tracing {
     type Batch = Vec<SpanData>;
 
-    async fn filled(&self) {
-        self.queue.0.filled().await;
+    async fn wait_filled(&self) {
+        self.queue.0.wait_filled().await;
     }
 
     /// The sink counts spans that do not fit.
@@ -358,7 +358,7 @@ mod tests {
         assert_eq!(queue.0.put(Vec::new()), 0);
         assert_eq!(queue.0.put(spans(WaitingSpans::CAP - 1)), 0);
         assert_eq!(queue.0.put(spans(3)), 2);
-        queue.0.filled().await;
+        queue.0.wait_filled().await;
         let mut taken = 0;
         while let more @ 1.. = queue.0.take(MAX_PER_REQUEST).len() {
             assert!(more <= MAX_PER_REQUEST);

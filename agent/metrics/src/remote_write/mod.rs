@@ -14,5 +14,5 @@ pub(crate) mod samples;
 mod settings;
 
 pub use delivery::{Inputs, StartError, start};
-pub use figures::{Fate, Figures, Request};
+pub use figures::{SampleFate, Figures, Request};
 pub use settings::{RemoteWriteSettings, Settings, SettingsError, receiver};

@@ -108,7 +108,7 @@ fn encode_value(last: Option<f64>, value: Option<f64>, record: &mut Vec<u8>) {
         _ if bits(last) == bits(value) => encode_varint(TAG_SAME, record),
         (_, None) => encode_varint(TAG_ABSENT, record),
         (last, Some(value)) => {
-            let change = whole(value).zip(whole(last.unwrap_or(0.0)));
+            let change = exact_integer(value).zip(exact_integer(last.unwrap_or(0.0)));
             match change.map(|(value, last)| value - last) {
                 Some(change) => {
                     let signed = (change << 1 ^ change >> 63).cast_unsigned();
@@ -136,14 +136,14 @@ fn decode_value(last: Option<f64>, record: &mut &[u8]) -> Option<Option<f64>> {
         signed => {
             let signed = signed - TAG_CHANGE;
             let change = (signed >> 1).cast_signed() ^ -(signed & 1).cast_signed();
-            Some(whole(last.unwrap_or(0.0))?.checked_add(change)? as f64)
+            Some(exact_integer(last.unwrap_or(0.0))?.checked_add(change)? as f64)
         }
     })
 }
 
 /// Returns a value as an integer, if that is exact.
 #[expect(clippy::cast_possible_truncation, reason = "the range is checked")]
-fn whole(value: f64) -> Option<i64> {
+fn exact_integer(value: f64) -> Option<i64> {
     let is_whole = value.abs() < MAX_EXACT_INTEGER && value.fract() == 0.0;
     // The sign of a zero would be lost.
     (is_whole && value.to_bits() != (-0.0_f64).to_bits()).then_some(value as i64)

@@ -189,7 +189,7 @@ fn references_count_only_while_no_subscription_gets_messages() {
 }
 
 #[test]
-fn participants_with_one_machine_id_are_on_one_host_whatever_their_guids_say() {
+fn participants_with_one_machine_id_are_on_one_host_despite_different_guids() {
     let machine = |host: &mut Host, prefix: GuidPrefix, number, id: &str| {
         let list = forge::participant_on(prefix, id, [10, 0, 0, 1]);
         host.announce(Message::from_fast(prefix).data(forge::SPDP, number, &list));
@@ -260,7 +260,7 @@ fn on_machine(host: &mut Host, number: u8, in_guid: u8, id: &str, address: [u8; 
 }
 
 #[test]
-fn cloned_machines_are_a_finding_and_participants_of_one_host_are_none() {
+fn cloned_machines_are_a_finding_and_participants_of_one_host_are_not() {
     let apart = |participants: &[(u8, &str, [u8; 4])]| {
         let mut host = Host::new();
         for (number, (in_guid, id, address)) in participants.iter().enumerate() {

@@ -199,7 +199,7 @@ fn wire_time(nanoseconds: u64) -> u64 {
 }
 
 #[test]
-fn an_offset_lies_within_its_bound_also_while_clocks_drift() {
+fn an_offset_is_within_its_bound_while_clocks_drift() {
     for ahead in [0, 500_000, 20_000_000, 3_000_000_000, -20_000_000] {
         for parts_per_million in [0, 50, -50] {
             let clock = Clock {
@@ -223,7 +223,7 @@ fn an_offset_lies_within_its_bound_also_while_clocks_drift() {
 }
 
 #[test]
-fn one_direction_gives_one_bound_and_no_offset() {
+fn one_direction_yields_one_bound_and_no_offset() {
     let mut pair = Pair::new();
     let clock = Clock::ahead(20_000_000);
     for _ in 0..500 {

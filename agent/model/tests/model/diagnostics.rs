@@ -123,7 +123,7 @@ fn the_last_status_of_each_part_is_kept_with_its_values_and_node() {
 }
 
 #[test]
-fn a_change_of_level_is_one_event_and_the_first_ok_is_none() {
+fn a_change_of_level_is_one_event_and_the_first_ok_is_no_event() {
     let mut robot = Robot::new();
     for level in [0, 0, 1, 1, 2, 3, 0] {
         robot.say(level, "text");
@@ -159,7 +159,7 @@ fn a_start_up_in_error_and_a_warning_are_no_findings() {
 }
 
 #[test]
-fn a_part_whose_messages_cease_becomes_stale_and_then_a_finding() {
+fn a_silent_diagnostic_part_becomes_stale_and_then_a_finding() {
     let mut robot = Robot::new();
     robot.go_on(0, 10);
     (0..4).for_each(|_| robot.domain.wait(1000));
@@ -189,7 +189,7 @@ fn a_part_that_publishes_every_forty_seconds_is_never_stale() {
 }
 
 #[test]
-fn a_node_that_departs_takes_its_parts_along() {
+fn the_diagnostics_of_a_removed_node_are_removed() {
     let mut robot = Robot::new();
     robot.go_on(2, 8);
     assert_eq!(robot.findings().len(), 1);
@@ -243,7 +243,7 @@ fn malformed_messages_count_and_keep_what_precedes_the_error() {
 }
 
 #[test]
-fn more_parts_than_the_table_holds_displace_the_most_silent_one() {
+fn a_diagnostic_part_beyond_the_cap_displaces_the_part_with_the_longest_silence() {
     let mut robot = Robot::new();
     for number in 0..1100 {
         let name = format!("part {number}");

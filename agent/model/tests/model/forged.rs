@@ -404,7 +404,7 @@ fn a_heartbeat_of_a_later_datagram_confirms_a_jump() {
 }
 
 #[test]
-fn samples_that_a_gap_excused_stay_excused_after_a_confirmed_jump() {
+fn samples_of_a_gap_stay_irrelevant_after_a_confirmed_jump() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     for number in 1..=100 {

@@ -266,7 +266,7 @@ fn a_recording_takes_at_most_the_documented_memory() {
 }
 
 #[test]
-fn all_limits_together_fit_into_the_memory_limit_of_the_unit() {
+fn all_limits_together_are_below_the_memory_limit_of_the_unit() {
     let unit = include_str!("../../../../systemd/ros2probe.service");
     let megabytes = unit
         .lines()

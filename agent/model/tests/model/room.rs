@@ -466,7 +466,7 @@ fn nodes_of_a_participant_with_a_higher_priority_displace_forged_ones() {
 }
 
 #[test]
-fn a_flood_into_full_tables_takes_no_longer_than_one_into_empty_ones() {
+fn a_flood_into_full_tables_takes_as_long_as_into_empty_tables() {
     const FLOOD: u32 = 20_000;
     let run = |crowd: u32| {
         let mut world = World::new(&["/points"], &Limits::default());

@@ -286,7 +286,7 @@ fn a_connection_whose_ends_were_both_silent_ends_once() {
 }
 
 #[test]
-fn a_restarted_agent_knows_the_senders_and_detects_the_end() {
+fn a_restarted_agent_restores_the_senders_and_detects_the_end() {
     let (mut before, gid) = talking();
     subscribe(&mut before, 1001, LISTENER);
     let token = publisher(LISTENER, 10, "/status");

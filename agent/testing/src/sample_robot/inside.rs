@@ -126,7 +126,7 @@ pub fn topic() -> TopicInside {
 pub fn source() -> InsideSourceFacts {
     InsideSourceFacts {
         mode: "full",
-        is_resting: false,
+        is_idle: false,
         shows_rates: true,
         libraries: vec![
             InsideLibrary {

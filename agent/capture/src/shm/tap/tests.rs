@@ -42,7 +42,7 @@ struct Host {
     directory: TempDir,
     tap: Tap,
     now: u64,
-    calendar: Rc<Cell<u64>>,
+    wall_clock: Rc<Cell<u64>>,
 }
 
 impl Host {
@@ -50,15 +50,15 @@ impl Host {
         let directory = tempfile::tempdir().unwrap();
         let directories = vec![directory.path().to_path_buf()];
         let directories = ShmDirectories::new(Scope::Directories(directories));
-        let calendar = Rc::new(Cell::new(SECOND));
-        let clock = Rc::clone(&calendar);
+        let wall_clock = Rc::new(Cell::new(SECOND));
+        let clock = Rc::clone(&wall_clock);
         let mut tap = Tap::new(directories, move || clock.get());
         tap.classifier.set(writer(), Some(Verdict::Meter));
         Self {
             directory,
             tap,
             now: SECOND,
-            calendar,
+            wall_clock,
         }
     }
 
@@ -81,7 +81,7 @@ impl Host {
     /// Advances the clock and polls.
     fn find_after(&mut self, nanoseconds: u64) -> Vec<Item> {
         self.now += nanoseconds;
-        self.calendar.set(self.calendar.get() + nanoseconds);
+        self.wall_clock.set(self.wall_clock.get() + nanoseconds);
         let mut found = Vec::new();
         self.tap.poll(self.now, &mut found);
         found
@@ -134,7 +134,7 @@ fn a_discovery_message_is_passed_on_whole_with_its_port() {
     let mut message = sample(1);
     message[44..48].copy_from_slice(&[0, 1, 0, 0xc2]);
     port.push(segment.put(&message));
-    host.calendar.set(4);
+    host.wall_clock.set(4);
     let found = host.find_after(1);
     let [Item::Message { time, port, bytes }] = found.as_slice() else {
         panic!("{found:?}");
@@ -175,10 +175,10 @@ fn the_time_of_a_message_is_read_after_its_announcement() {
     let (mut port, mut segment) = (host.port(7411), host.segment(1));
     host.poll_after(SECOND);
     // The message is sent while the poll is in progress.
-    let clock = Rc::clone(&host.calendar);
-    host.tap.calendar = Box::new(move || clock.replace(clock.get() + 1000));
+    let clock = Rc::clone(&host.wall_clock);
+    host.tap.wall_clock = Box::new(move || clock.replace(clock.get() + 1000));
     port.push(segment.put(&sample(1)));
-    let sent = host.calendar.get();
+    let sent = host.wall_clock.get();
     let mut found = Vec::new();
     host.tap.poll(host.now, &mut found);
     let [Item::Record(record)] = found.as_slice() else {
@@ -192,7 +192,7 @@ fn a_silent_port_is_polled_every_time_while_every_message_is_needed() {
     let mut host = Host::new();
     let (mut port, mut segment) = (host.port(7411), host.segment(1));
     host.poll_after(SECOND);
-    host.tap.misses_nothing = true;
+    host.tap.needs_every_message = true;
     host.poll_after(SILENT_AFTER + 1);
     host.poll_after(MILLISECOND);
     let descriptor = segment.put(&sample(5));
@@ -377,7 +377,7 @@ fn a_flood_at_one_port_does_not_starve_the_others() {
     let mut flooded = PortImage::new(7400, 256, 0x100).in_directory(host.path());
     let (mut other, mut segment) = (host.port(7411), host.segment(1));
     host.poll_after(SECOND);
-    host.tap.is_hurried = true;
+    host.tap.is_urgent = true;
     let descriptor = segment.put(&sample(1));
     let mut found = Vec::new();
     for round in 0..4 {
@@ -393,7 +393,7 @@ fn a_flood_at_one_port_does_not_starve_the_others() {
 }
 
 #[test]
-fn constantly_expected_files_cost_no_more_than_the_share_for_listing() {
+fn constantly_expected_files_use_no_more_cpu_than_the_listing_share() {
     let mut host = Host::new();
     for number in 0..2000 {
         fs::write(host.path().join(format!("fastrtps_port{number}")), "").unwrap();
@@ -510,7 +510,7 @@ fn ports_of_dead_processes_beyond_the_cap_are_opened_again() {
     for group in numbers.chunks(400) {
         let ports: Vec<_> = group.iter().map(|number| host.port(*number)).collect();
         // A search would forget the ports of dead processes, so it is postponed.
-        host.tap.found = host.now + 1000 * SECOND;
+        host.tap.last_search = host.now + 1000 * SECOND;
         host.poll_after(100 * SECOND);
         for port in ports {
             fs::remove_file(port.path(host.path())).unwrap();
@@ -545,7 +545,7 @@ fn an_urgent_poll_reads_some_ports_and_the_next_polls_read_the_others() {
     let mut segment = host.segment(1);
     let mut ports: Vec<_> = (0..24).map(|index| host.port(7411 + 2 * index)).collect();
     host.poll_after(SECOND);
-    host.tap.is_hurried = true;
+    host.tap.is_urgent = true;
     for round in 1..=5 {
         for (port, number) in ports.iter_mut().zip(100 * round..) {
             port.push(segment.put(&sample(number)));

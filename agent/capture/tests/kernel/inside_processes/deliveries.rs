@@ -170,7 +170,7 @@ fn a_message_of_another_host_that_arrives_late_names_the_network() -> Result<()>
 }
 
 #[test]
-fn a_message_that_nobody_receives_names_the_socket() -> Result<()> {
+fn an_unreceived_message_names_the_socket() -> Result<()> {
     let mut way = Way::new()?;
     assert_waits_in_socket(&mut way)?;
     Ok(())
@@ -186,7 +186,7 @@ fn a_message_that_the_middleware_keeps_names_the_middleware() -> Result<()> {
 }
 
 #[test]
-fn a_message_keeps_its_place_before_others_and_a_full_buffer() -> Result<()> {
+fn queue_times_are_known_behind_other_messages_and_at_a_full_buffer() -> Result<()> {
     let mut way = Way::new()?;
     way.send(Duration::ZERO)?;
     way.send(Duration::ZERO)?;

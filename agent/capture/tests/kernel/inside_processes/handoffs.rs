@@ -149,7 +149,7 @@ fn a_message_that_the_middleware_passes_on_late_names_the_middleware() {
 }
 
 #[test]
-fn a_message_for_a_thread_without_a_cpu_names_who_ran_instead() {
+fn a_delayed_wakeup_names_the_thread_that_ran_instead() {
     let mut subscriber = Subscriber::new();
     let listener = subscriber.listener();
     for command in [

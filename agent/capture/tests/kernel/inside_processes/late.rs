@@ -233,7 +233,7 @@ fn a_call_that_waits_for_its_pages_is_named_so() {
 }
 
 #[test]
-fn a_stopped_call_names_who_continued_it() {
+fn a_stopped_call_names_the_thread_that_continued_it() {
     let (mut robot, mut process) = started();
     let id = process.child.id().cast_signed();
     let stop = std::thread::spawn(move || {

@@ -121,7 +121,7 @@ fn a_connection_seen_at_the_sockets_is_not_reported_again_on_the_wire() -> Resul
         syn: true,
         end: false,
         boundary: Some(Protocol::Zenoh),
-        before: Before::Unknown,
+        before: MissingBefore::Unknown,
         bytes: &init,
         length: init.len() as u32,
     };

@@ -158,7 +158,7 @@ impl<'a> RecordingOutput<'a> {
     /// Reports topics that are sampled from the start.
     pub(super) fn sampled(&mut self, recorder: &Recorder<'_>, graph: &GraphSnapshot) {
         let topics = graph.topics.iter();
-        let topics = topics.filter(|topic| is_sampled(topic) && recorder.takes(topic));
+        let topics = topics.filter(|topic| is_sampled(topic) && recorder.is_selected(topic));
         if matches!(self.sampling, Sampling::Sampled(_)) {
             self.print_sampled(topics.map(|topic| topic.name.clone()).collect());
         }
@@ -174,7 +174,7 @@ impl<'a> RecordingOutput<'a> {
     }
 
     /// Reports once, after some time, why topics are silent.
-    fn explain(&mut self, recorder: &Recorder<'_>) {
+    fn print_silence_reasons(&mut self, recorder: &Recorder<'_>) {
         if self.begun.elapsed() < SILENCE_TIMEOUT {
             return;
         }
@@ -182,7 +182,7 @@ impl<'a> RecordingOutput<'a> {
             return;
         };
         let graph = locked(&graph_cache).latest_snapshot();
-        let mut lines = unobserved_lines(&recorder.unobserved(&graph));
+        let mut lines = unobserved_lines(&recorder.unobserved_topics(&graph));
         let is_known = |name: &&String| graph.topics.iter().any(|topic| topic.name == **name);
         let unknown = recorder
             .options()
@@ -199,7 +199,7 @@ impl<'a> RecordingOutput<'a> {
     }
 
     fn recording(&mut self, recorder: &Recorder<'_>) {
-        self.explain(recorder);
+        self.print_silence_reasons(recorder);
         if let Some(text) = self
             .unknown_writers
             .warning(recorder.options(), Instant::now())

@@ -111,7 +111,7 @@ pub(super) fn unobserved_lines(unobserved: &BTreeMap<String, String>) -> Vec<Str
     let lines = UNOBSERVED_REASONS.iter().filter_map(|(why, what)| {
         let topics = unobserved.iter().filter(|(_, reason)| reason == why);
         let names: Vec<&str> = topics.map(|(name, _)| name.as_str()).collect();
-        let line = format!("{}: no message recorded; {what}", few(&names));
+        let line = format!("{}: no message recorded; {what}", shortened_list(&names));
         (!names.is_empty()).then_some(line)
     });
     lines.collect()
@@ -124,7 +124,7 @@ fn counted(count: u64, thing: &str) -> String {
 }
 
 /// Returns the first names of a list, and the number of others.
-fn few(names: &[&str]) -> String {
+fn shortened_list(names: &[&str]) -> String {
     let shown = names
         .iter()
         .take(MAX_NAMED_TOPICS)
@@ -178,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn messages_of_topics_that_a_bag_lacks_are_named_and_make_it_incomplete() {
+    fn topics_missing_in_a_bag_are_named_and_make_it_incomplete() {
         let mut report = Report::default();
         let unobserved = |why: &str| ("/imu".to_owned(), why.to_owned());
         report.unobserved.extend([unobserved(NO_SUBSCRIBER)]);

@@ -82,7 +82,7 @@ pub(super) fn listen(give: Sender<Command>, phase: Phase) -> io::Result<()> {
                     std::process::exit(EXIT_INTERRUPTED.into());
                 }
                 1 => Command::Stop,
-                2 => Command::Hurry,
+                2 => Command::Abort,
                 _ => {
                     let text = "Interrupted; `rp bag reindex` completes the bag";
                     log("ERROR", text);

@@ -52,7 +52,7 @@ pub struct Answer {
     pub took: Duration,
 }
 
-/// A message that [`converse`] sends.
+/// A message that [`run_conversation`] sends.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Planned {
     /// Purpose, for people.
@@ -63,7 +63,7 @@ pub struct Planned {
     pub note: &'static str,
 }
 
-/// Returns what [`converse`] sends to a router that answers.
+/// Returns what [`run_conversation`] sends to a router that answers.
 #[must_use]
 pub fn plan(domain_id: Option<u32>) -> [Planned; 4] {
     let planned = |what, bytes: Vec<u8>, note| Planned {
@@ -118,7 +118,7 @@ pub fn connect(address: &RouterAddress) -> Result<(TcpStream, SocketAddr), Route
 /// # Errors
 ///
 /// Fails if the router breaks, ends or refuses the conversation, or is silent.
-pub fn converse(
+pub fn run_conversation(
     stream: TcpStream,
     peer: SocketAddr,
     domain_id: Option<u32>,
@@ -186,12 +186,12 @@ impl Conversation {
         sent.map_err(|source| self.broken(source))?;
         self.sent.add(bytes.len());
         self.after = what;
-        self.within(TIMEOUT);
+        self.set_timeout(TIMEOUT);
         Ok(())
     }
 
     /// Sets the maximum wait for the next answer.
-    fn within(&mut self, limit: Duration) {
+    fn set_timeout(&mut self, limit: Duration) {
         self.limit = limit;
         self.deadline = Instant::now() + limit;
     }
@@ -214,7 +214,7 @@ impl Conversation {
                 for outgoing in session.receive(batch).map_err(unusable)? {
                     self.send(outgoing.what, &outgoing.bytes)?;
                     if session.step() == Step::Request {
-                        self.within(MAX_DURATION);
+                        self.set_timeout(MAX_DURATION);
                     }
                 }
                 if session.is_over() {

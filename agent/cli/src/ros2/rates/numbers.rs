@@ -94,7 +94,7 @@ impl Numbers {
     pub(super) fn place(&mut self, message: Message) -> Place {
         let newest = self.newest;
         if message.number <= newest.number {
-            return self.late(message);
+            return self.add_late(message);
         }
         self.newest = message;
         if !self.has_begun {
@@ -123,7 +123,7 @@ impl Numbers {
     }
 
     /// Adds a message with a number that is not above the newest one.
-    fn late(&mut self, message: Message) -> Place {
+    fn add_late(&mut self, message: Message) -> Place {
         let newest = self.newest;
         let is_unseen = |gap: &RangeInclusive<u64>| gap.contains(&message.number);
         if self.unseen.iter().any(is_unseen) {

@@ -113,7 +113,7 @@ impl Disk<'_, '_> {
 }
 
 #[test]
-fn a_full_read_only_or_removed_disk_costs_only_the_files_on_it_and_no_message() -> Result<()> {
+fn a_full_read_only_or_removed_disk_loses_only_its_files_and_no_message() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let place = directory.path().join("disk");

@@ -111,7 +111,7 @@ impl Robot<'_, '_> {
 }
 
 #[test]
-fn a_disk_that_fails_with_eio_costs_only_the_files_on_it_and_no_message() -> Result<()> {
+fn an_eio_disk_loses_only_its_files_and_no_message() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let place = directory.path().join("disk");

@@ -23,7 +23,7 @@ const LOOP: &str = r#"i=0; while [ $i -lt $1 ]; do
 done"#;
 
 #[test]
-fn thousands_of_short_processes_cost_bounded_memory_and_no_message_of_others() -> Result<()> {
+fn thousands_of_short_processes_use_bounded_memory_and_lose_no_message_of_others() -> Result<()> {
     let all: u32 = if long().is_some() { 20_000 } else { 2_000 };
     let allowance = Allowance::of_the_unit()?;
     let group = Confined::to(&allowance)?;

@@ -25,7 +25,7 @@ fn robot(host: &Host<'_>) -> Result<[Process; 3]> {
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
-fn an_agent_that_starts_last_counts_and_learns_the_names_from_the_router() -> Result<()> {
+fn a_late_agent_counts_and_reads_the_names_from_the_router() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
     let [_router, mut sensor, mut one] = robot(&host)?;

@@ -130,7 +130,7 @@ fn the_nodes_of_an_action_have_their_full_names() {
 }
 
 #[test]
-fn commands_that_humble_lacks_print_the_output_of_jazzy() {
+fn commands_missing_in_humble_print_the_output_of_jazzy() {
     let capture = own().join("graph.pcap.gz");
     let ask = |words: &str| {
         let mut words: Vec<&str> = words.split(' ').collect();

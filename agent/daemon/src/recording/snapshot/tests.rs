@@ -200,7 +200,7 @@ impl Robot {
     }
 
     fn shown(&mut self) -> SnapshotFigures {
-        self.task.show();
+        self.task.publish_figures();
         self.figures.snapshots()[0].1
     }
 

@@ -27,7 +27,7 @@ use super::body_stream::{Pieces, stream_of};
 use super::endpoint::texts;
 use super::parameters::Parameters;
 use super::problem::{Code, Problem, ProblemBody};
-use super::security::Granted;
+use super::security::Rights;
 use crate::config::{Watch, Watchlist};
 use crate::events::EventLog;
 use crate::events::{EVENTS, Position, Reader, Record, Value};
@@ -125,7 +125,7 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
 )]
 async fn events(
     State(context): State<Context>,
-    Extension(granted): Extension<Granted>,
+    Extension(granted): Extension<Rights>,
     headers: HeaderMap,
     Parameters(selection): Parameters<Selection>,
 ) -> Result<Response, Problem> {
@@ -145,7 +145,7 @@ async fn events(
             Position::Unknown => (0, true),
         },
     };
-    let permit = STREAM_SLOTS.take(granted.is_holder()).ok_or_else(|| {
+    let permit = STREAM_SLOTS.take(granted.has_token()).ok_or_else(|| {
         let detail = format!("{MAX_STREAMS} streams are open, which is the limit");
         Problem::new(Code::TooManyStreams, detail)
     })?;
@@ -213,7 +213,7 @@ impl Stream {
     fn read(&mut self) -> bool {
         let batch = self.log.read(self.place, MAX_BATCH);
         if batch.lagged > 0 {
-            self.log.overtook(Reader::Stream, batch.lagged);
+            self.log.count_overwritten(Reader::Stream, batch.lagged);
             self.place += batch.lagged;
             self.lag(Some(batch.lagged), "overwritten");
         }

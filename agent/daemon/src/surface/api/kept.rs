@@ -24,12 +24,12 @@ static LISTED_BAGS: Mutex<Vec<KeptBag>> = Mutex::new(Vec::new());
 /// directory, and so it blocks.
 pub(super) fn kept(root: &Path, known: &BTreeSet<String>) -> Vec<KeptBag> {
     let mut listed = LISTED_BAGS.lock().unwrap_or_else(PoisonError::into_inner);
-    *listed = among(root, known, MAX_ENTRIES, &listed);
+    *listed = bags_among(root, known, MAX_ENTRIES, &listed);
     listed.clone()
 }
 
 /// Returns the bags among this number of entries. `before` is an earlier list.
-fn among(root: &Path, known: &BTreeSet<String>, most: usize, before: &[KeptBag]) -> Vec<KeptBag> {
+fn bags_among(root: &Path, known: &BTreeSet<String>, most: usize, before: &[KeptBag]) -> Vec<KeptBag> {
     let entries = fs::read_dir(root).into_iter().flatten();
     let bags = entries.take(most).filter_map(|entry| {
         let entry = entry.ok()?;
@@ -135,6 +135,6 @@ mod tests {
             bag(root, &format!("bag_{number}"), "bag_0.mcap");
         }
         assert_eq!(kept(root, &BTreeSet::new()).len(), MAX_KEPT);
-        assert_eq!(among(root, &BTreeSet::new(), 3, &[]).len(), 3);
+        assert_eq!(bags_among(root, &BTreeSet::new(), 3, &[]).len(), 3);
     }
 }

@@ -88,7 +88,7 @@ pub use pipe::serve as serve_in_process;
 use problem::{Code, Problem};
 use reload::Reloader;
 use ros2probe_message::Library;
-use security::{Door, Needs};
+use security::{AccessRules, Needs};
 pub use server::{OpenError, Server};
 
 /// Maximum time that a request waits for a fresh snapshot, which shows the effects of earlier
@@ -142,7 +142,7 @@ impl Context {
     /// Requests the observation of calls inside processes, and waits at most five seconds until
     /// their rates are known.
     async fn observe_calls(&self) {
-        self.latest.want_calls();
+        self.latest.request_calls();
         let is_known = async {
             loop {
                 self.latest.refresh(FRESH_STATE_TIMEOUT).await;
@@ -187,7 +187,7 @@ fn nouns(context: Option<&Context>) -> OpenApiRouter<Context> {
     };
     let needs = |read, change, routes: OpenApiRouter<Context>| {
         let needs = Needs { read, change };
-        routes.layer(middleware::from_fn_with_state(needs, security::within))
+        routes.layer(middleware::from_fn_with_state(needs, security::require_rights))
     };
     OpenApiRouter::with_openapi(openapi::head())
         .merge(needs(Access::Read, Access::Watch, watch::routes()))
@@ -248,7 +248,7 @@ struct Streamed;
 
 /// Limits the number of large answers, as [`super::large_responses`] describes.
 async fn take_turns(Extract(context): Extract<Context>, request: Request, next: Next) -> Response {
-    let Some(turn) = VIEW_RESPONSES.turn().await else {
+    let Some(turn) = VIEW_RESPONSES.permit().await else {
         context.limits.reached(Limit::ApiClients, 1);
         let detail = "memory for responses is used up by slow readers";
         return Problem::new(Code::TooManyClients, detail).into_response();
@@ -261,14 +261,14 @@ async fn take_turns(Extract(context): Extract<Context>, request: Request, next: 
     match to_bytes(body, usize::MAX).await {
         Ok(bytes) => {
             head.headers.insert(CONTENT_LENGTH, bytes.len().into());
-            Response::from_parts(head, turn.keep(bytes))
+            Response::from_parts(head, turn.body(bytes))
         }
         Err(_) => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
     }
 }
 
 /// Returns the routes with the access checks of `door`.
-fn router(context: &Context, door: Arc<Door>) -> Router {
+fn router(context: &Context, door: Arc<AccessRules>) -> Router {
     let (router, _) = nouns(Some(context)).split_for_parts();
     let files = (door.is_for_browsers() && context.page.is_served()).then(|| {
         let guard = middleware::from_fn_with_state(Arc::clone(&door), security::guard_files);

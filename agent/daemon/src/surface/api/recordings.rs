@@ -23,7 +23,7 @@ use super::kept;
 use super::problem::{Code, Problem, ProblemBody};
 use super::scope::domain;
 use super::security::MAX_BODY;
-use super::turns::in_turn;
+use super::turns::run_blocking;
 use crate::recording::{Command, Recording, RecordingOptions, Refusal};
 use ros2probe_api::recordings::{self as answers, FilterOptions, RecordingList, RecordingRequest};
 use ros2probe_bag::{Form, Options, Storage};
@@ -63,7 +63,7 @@ async fn list(State(context): State<Context>) -> Json<RecordingList> {
     let directory = context.recordings.directory();
     let known = recordings.iter().map(|each| each.name.clone()).collect();
     let root = directory.map(FilePath::to_owned);
-    let listed = in_turn(&LISTING_PERMIT, LIST_TIMEOUT, move || {
+    let listed = run_blocking(&LISTING_PERMIT, LIST_TIMEOUT, move || {
         root.map(|root| kept::kept(&root, &known))
     });
     let kept = listed.await.ok().flatten().unwrap_or_default();
@@ -172,7 +172,7 @@ async fn end(
 ) -> Result<Response, Problem> {
     let recording = find(&context, &name)?;
     recording.command(Command::Stop);
-    let status = if recording.over(COMPLETION_TIMEOUT).await {
+    let status = if recording.wait_complete(COMPLETION_TIMEOUT).await {
         StatusCode::OK
     } else {
         StatusCode::ACCEPTED
@@ -286,7 +286,7 @@ fn wanted(request: RecordingRequest) -> Result<RecordingOptions, Problem> {
     Ok(RecordingOptions {
         options: options().map_err(|error| invalid(error.to_string()))?,
         name: request.name,
-        asked,
+        requested: asked,
         domain_id: request.domain_id,
         paused: request.paused,
     })

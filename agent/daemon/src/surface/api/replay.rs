@@ -139,7 +139,7 @@ fn view(state: &Known, pace: Pace) -> ReplayState {
         timestamp_seconds: state.known().time().seconds(),
         read_ratio: agent.replayed,
         is_finished: agent.finished,
-        is_paused: pace.is_still(),
+        is_paused: pace.is_paused(),
         speed: pace.times(agent.replay_speed),
         is_jumping: pace.jump.is_some() && !agent.finished,
     }
@@ -150,7 +150,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_replay_goes_only_forward_at_a_possible_speed() {
+    fn replay_requests_backwards_or_at_an_invalid_speed_are_refused() {
         let now = Timestamp(100 * SECOND);
         let of = |change: fn(&mut ReplayRequest)| {
             let mut request = ReplayRequest::default();

@@ -26,7 +26,7 @@ use super::endpoint::printed;
 use super::parameters::Parameters;
 use super::problem::{Code, Problem, ProblemBody};
 use super::scope::domain;
-use super::security::Granted;
+use super::security::Rights;
 use crate::agent_facts::SourceKind;
 use crate::config::Access;
 use crate::subscriptions::line::{line, offered};
@@ -133,7 +133,7 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
 )]
 async fn samples(
     State(context): State<Context>,
-    Extension(granted): Extension<Granted>,
+    Extension(granted): Extension<Rights>,
     Parameters(wanted): Parameters<Wanted>,
 ) -> Result<Response, Problem> {
     if wanted.payload {

@@ -82,12 +82,12 @@ async fn show(
     let domain = Domain::of(of.domain_id).checked()?;
     let above = of
         .above_ms
-        .map(|above| within("above_ms", above, LONGEST_MS));
+        .map(|above| number_in_range("above_ms", above, LONGEST_MS));
     let above = above.transpose()?;
     let above = above.map(|above| Duration::from_secs_f64(above / 1e3));
-    let last = of.last_s.map(|last| within("last_s", last, LONGEST_S));
+    let last = of.last_s.map(|last| number_in_range("last_s", last, LONGEST_S));
     let last = last.transpose()?.map(Duration::from_secs_f64);
-    context.latest.want_late(of.name.as_deref(), above);
+    context.latest.request_late_calls(of.name.as_deref(), above);
     let state = context.state().await;
     let snapshot = state.known();
     let source = state.agent.inside.as_ref();
@@ -106,7 +106,7 @@ async fn show(
 }
 
 /// Returns a number from 0 to `largest`, or the problem of another one.
-fn within(name: &str, number: f64, largest: f64) -> Result<f64, Problem> {
+fn number_in_range(name: &str, number: f64, largest: f64) -> Result<f64, Problem> {
     match (0.0..=largest).contains(&number) {
         true => Ok(number),
         false => {
@@ -165,7 +165,7 @@ fn why<'a>(
             let mut shown = late_callback(callback, known, since, clock);
             if selection.has_history {
                 let calls = callback.history.iter().filter(|entry| entry.at >= since);
-                shown.history = calls.map(|entry| moment(entry, clock)).collect();
+                shown.history = calls.map(|entry| summary(entry, clock)).collect();
             }
             shown
         })
@@ -239,7 +239,7 @@ fn late_callback<'a>(
     }
 }
 
-fn moment(entry: &facts::LateEntry, clock: WallClock) -> LateCallSummary<'_> {
+fn summary(entry: &facts::LateEntry, clock: WallClock) -> LateCallSummary<'_> {
     LateCallSummary {
         timestamp_seconds: clock.wall_time(entry.at).seconds(),
         total_seconds: entry.total.as_secs_f64(),

@@ -100,7 +100,7 @@ struct Subscribed {
     previous: Previous,
     since: Instant,
     /// Whether a message of the subscription was sent.
-    is_heard: bool,
+    has_sent: bool,
 }
 
 /// Messages lost for one reason, since the status of that reason was last removed.
@@ -177,12 +177,12 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
             tracing::debug!(%code, reason, "closed a viewer");
             // Dropping the subscription ends the interest in its topics first.
             self.messages = None;
-            let _ = timeout(CLOSE_TIMEOUT, self.say_farewell(code, reason)).await;
+            let _ = timeout(CLOSE_TIMEOUT, self.close_with_reason(code, reason)).await;
         }
     }
 
     async fn serve(&mut self) -> Result<(), End> {
-        self.introduce().await?;
+        self.send_server_info().await?;
         let mut ticks = ticks();
         let mut count = 0_u32;
         loop {
@@ -194,7 +194,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
                 },
                 changed = self.tables.changed() => {
                     changed.map_err(|_| End::Gone)?;
-                    self.show().await?;
+                    self.send_changes().await?;
                 }
                 _ = ticks.tick() => {
                     count = count.wrapping_add(1);
@@ -207,7 +207,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
                 item = next(&mut self.messages) => {
                     let mut item = item;
                     for _ in 0..MAX_BATCH {
-                        self.pass(item).await?;
+                        self.send_item(item).await?;
                         match self.messages.as_mut().and_then(Subscription::try_next) {
                             Some(next) => item = Some(next),
                             None => break,
@@ -220,7 +220,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
     }
 
     /// Sends the description of the server.
-    async fn introduce(&mut self) -> Result<(), End> {
+    async fn send_server_info(&mut self) -> Result<(), End> {
         let shared = Arc::clone(&self.shared);
         let capabilities: &[_] = match shared.is_replay {
             true => &["connectionGraph", "time"],
@@ -263,7 +263,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
                 Ok(())
             }
             Ok(Request::UnsubscribeGraph) => {
-                self.leave_graph();
+                self.unsubscribe_graph();
                 Ok(())
             }
             Ok(Request::Unsupported(op)) => self.unsupported(&format!("`{op}`")).await,
@@ -306,7 +306,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
                 channel: Arc::clone(channel),
                 previous: Previous::default(),
                 since: Instant::now(),
-                is_heard: false,
+                has_sent: false,
             };
             self.subscribed.insert(*id, subscribed);
             fresh.extend(content.messages_of());
@@ -391,7 +391,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
     }
 
     /// Sends the changes of the channels and the graph, and the statistics.
-    async fn show(&mut self) -> Result<(), End> {
+    async fn send_changes(&mut self) -> Result<(), End> {
         let table = self.tables.borrow_and_update().clone();
         let Some(table) = table else {
             return Ok(());
@@ -471,9 +471,9 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
     }
 
     /// Sends an item of the subscription to the client, or counts its losses.
-    async fn pass(&mut self, item: Option<Item>) -> Result<(), End> {
+    async fn send_item(&mut self, item: Option<Item>) -> Result<(), End> {
         match item {
-            Some(Item::Sample(sample)) => self.pass_sample(&sample).await,
+            Some(Item::Sample(sample)) => self.send_sample(&sample).await,
             Some(Item::Missed(missed)) => {
                 self.count(&missed);
                 Ok(())
@@ -495,13 +495,13 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
         }
     }
 
-    async fn pass_sample(&mut self, sample: &Sample) -> Result<(), End> {
+    async fn send_sample(&mut self, sample: &Sample) -> Result<(), End> {
         let id = self.ids.get(&Content::of(&sample.topic));
         match (id, &sample.payload) {
             (Some(id), Some(payload)) => {
                 let id = *id;
                 if let Some(subscribed) = self.subscribed.get_mut(&id) {
-                    subscribed.is_heard = true;
+                    subscribed.has_sent = true;
                 }
                 self.send_data(id, sample.time, payload).await
             }
@@ -569,7 +569,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
     /// topics.
     fn unsubscribed_now(&self) -> String {
         let silent = self.subscribed.values().filter_map(|subscribed| {
-            let is_silent = !subscribed.is_heard && subscribed.since.elapsed() >= SILENCE_TIMEOUT;
+            let is_silent = !subscribed.has_sent && subscribed.since.elapsed() >= SILENCE_TIMEOUT;
             let key = subscribed.channel.content.messages_of()?;
             is_silent.then(|| (key, subscribed.channel.topic()))
         });
@@ -601,7 +601,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
         Ok(())
     }
 
-    fn leave_graph(&mut self) {
+    fn unsubscribe_graph(&mut self) {
         if self.graph.take().is_some() {
             self.shared.change_graphs(-1);
         }

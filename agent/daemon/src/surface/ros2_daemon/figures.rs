@@ -146,7 +146,7 @@ impl Ros2DaemonFigures {
     }
 
     /// Counts a refusal.
-    pub(super) fn refuse(&self, reason: Refused) {
+    pub(super) fn count_refusal(&self, reason: Refused) {
         if let Some(count) = self.refused.get(reason as usize) {
             count.fetch_add(1, Ordering::Relaxed);
         }

@@ -93,7 +93,7 @@ impl Function {
             return Err(self.missing(self.parameters.get(given..).unwrap_or_default()));
         }
         if given > most {
-            return Err(self.too_many(least, most, given));
+            return Err(self.too_many_arguments(least, most, given));
         }
         if let Some(Argument::Boolean(true)) = call.arguments.get(least) {
             let flag = self.flag.unwrap_or_default();
@@ -122,7 +122,7 @@ impl Function {
     }
 
     /// Returns Python's exception for too many arguments, which counts `self`.
-    fn too_many(&self, least: usize, most: usize, given: usize) -> Fault {
+    fn too_many_arguments(&self, least: usize, most: usize, given: usize) -> Fault {
         let mut takes = String::new();
         let _ = match least == most {
             true => write!(takes, "{}", most + 1),

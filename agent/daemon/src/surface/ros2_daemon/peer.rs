@@ -62,7 +62,7 @@ fn process(proc: &Path, user: u32, inode: u64) -> Option<PathBuf> {
     let processes = fs::read_dir(proc)
         .ok()?
         .filter_map(|entry| Some(entry.ok()?.path()));
-    let mut processes = numbered(processes)
+    let mut processes = process_paths(processes)
         .filter(|path| fs::metadata(path).is_ok_and(|metadata| metadata.uid() == user));
     processes.find(|path| {
         let descriptors = fs::read_dir(path.join("fd")).into_iter().flatten();
@@ -74,7 +74,7 @@ fn process(proc: &Path, user: u32, inode: u64) -> Option<PathBuf> {
 }
 
 /// Returns the paths of processes, whose names are numbers, up to the cap.
-fn numbered(paths: impl Iterator<Item = PathBuf>) -> impl Iterator<Item = PathBuf> {
+fn process_paths(paths: impl Iterator<Item = PathBuf>) -> impl Iterator<Item = PathBuf> {
     let is_number = |path: &PathBuf| {
         let name = path.file_name().and_then(|name| name.to_str());
         name.is_some_and(|name| name.bytes().all(|byte| byte.is_ascii_digit()))
@@ -206,7 +206,7 @@ mod tests {
             .map(|id| id.to_string().into())
             .collect();
         let names = ids.iter().cloned().chain(["net".into(), "self".into()]);
-        assert_eq!(numbered(names).count(), MAX_PROCESSES);
+        assert_eq!(process_paths(names).count(), MAX_PROCESSES);
     }
 
     #[test]

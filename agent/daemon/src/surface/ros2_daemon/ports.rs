@@ -75,7 +75,7 @@ impl Ports {
             }
             let is_left_out = self.ports.insert(*domain_id, Port::Waiting).is_some();
             if is_left_out && port(*domain_id).is_some() {
-                self.show(*domain_id, PortState::Limit);
+                self.set_state(*domain_id, PortState::Limit);
             }
         }
         let is_due = |port: &Port| match port {
@@ -99,7 +99,7 @@ impl Ports {
         let Port::Open(_, end) = std::mem::replace(port, Port::Released(now)) else {
             return None;
         };
-        self.show(domain_id, PortState::Released);
+        self.set_state(domain_id, PortState::Released);
         Some(end)
     }
 
@@ -173,11 +173,11 @@ impl Ports {
             Err(error) => (Port::Waiting, PortState::Failed(error.to_string())),
         };
         self.ports.insert(domain_id, port);
-        self.show(domain_id, state);
+        self.set_state(domain_id, state);
     }
 
     /// Records the state of a port, and logs its changes.
-    fn show(&self, domain_id: u32, state: PortState) {
+    fn set_state(&self, domain_id: u32, state: PortState) {
         if !self.figures.set_port(domain_id, state.clone()) {
             return;
         }
@@ -225,7 +225,7 @@ mod tests {
     use super::*;
 
     #[tokio::test(start_paused = true)]
-    async fn a_port_of_another_process_is_taken_over_a_while_after_it_is_free() {
+    async fn a_free_port_of_another_process_is_taken_over_after_a_delay() {
         const OTHER: u32 = DOMAIN + 3;
         let figures = Arc::<Ros2DaemonFigures>::default();
         let mut ports = Ports::new(Arc::clone(&figures));

@@ -128,18 +128,18 @@ impl Requests {
     async fn respond(&self, request: Request<Incoming>, origin: &Origin) -> Response<Body> {
         let (head, body) = request.into_parts();
         if let Err((reason, status)) = check(&head.method, head.uri.path(), &head.headers) {
-            self.figures.refuse(reason);
+            self.figures.count_refusal(reason);
             return refusal(status);
         }
         let Ok(body) = to_bytes(Body::new(body), MAX_BODY).await else {
-            self.figures.refuse(Refused::Size);
+            self.figures.count_refusal(Refused::Size);
             return refusal(StatusCode::PAYLOAD_TOO_LARGE);
         };
         // Until this call, the connection counts as idle and can be closed for others, because its
         // client may never finish.
         origin.state.requested();
-        let Some(turn) = LARGE_ANSWERS.turn().await else {
-            self.figures.refuse(Refused::Memory);
+        let Some(turn) = LARGE_ANSWERS.permit().await else {
+            self.figures.count_refusal(Refused::Memory);
             return refusal(StatusCode::SERVICE_UNAVAILABLE);
         };
         let user_agent = head
@@ -150,7 +150,7 @@ impl Requests {
             Ok(call) => self.answer(&call, origin, user_agent).await,
             Err(malformed) => (Err(self.malformed(malformed)), false),
         };
-        let body = turn.keep(Bytes::from(answer(&result)));
+        let body = turn.body(Bytes::from(answer(&result)));
         let mut response = Response::new(body);
         let headers = response.headers_mut();
         headers.insert(CONTENT_TYPE, HeaderValue::from_static("text/xml"));
@@ -170,7 +170,7 @@ impl Requests {
     ) -> (Result<Value, Fault>, bool) {
         self.figures.request(&call.method);
         let is_about_graph = !call.method.starts_with("system.");
-        if is_about_graph && self.latest.state().agent.at.elapsed() > MAX_STATE_AGE {
+        if is_about_graph && self.latest.state().agent.collected_at.elapsed() > MAX_STATE_AGE {
             self.latest.refresh(STATE_TIMEOUT).await;
         }
         let state = self.latest.state();
@@ -216,7 +216,7 @@ impl Requests {
 
     /// Counts a body that is not a call, and returns Python's exception for it.
     fn malformed(&self, malformed: Malformed) -> Fault {
-        self.figures.refuse(Refused::Malformed);
+        self.figures.count_refusal(Refused::Malformed);
         let class = match malformed {
             Malformed::Encoding | Malformed::Xml => "xml.parsers.expat.ExpatError",
             _ => "xmlrpc.client.ResponseError",

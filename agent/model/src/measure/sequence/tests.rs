@@ -204,7 +204,7 @@ fn withdrawn_samples_are_decided_after_the_grace_period() {
 }
 
 #[test]
-fn a_gap_submessage_ahead_of_the_data_does_not_excuse_later_samples() {
+fn a_gap_ahead_of_the_data_marks_no_later_sample_irrelevant() {
     let mut bench = Bench::default();
     bench.receive([1]);
     bench.sequence.gap(

@@ -398,7 +398,7 @@ fn a_message_that_only_a_heartbeat_announces_counts_as_the_last_message() {
 }
 
 #[test]
-fn a_writer_whose_messages_polling_misses_may_seem_silent_for_long() {
+fn missed_polls_extend_the_possible_silence_of_a_writer() {
     let slowest = Duration::from_secs(2);
     let silence_of = |seen: &dyn Fn(u64) -> bool| {
         let mut bench = Bench::new(RELIABLE);

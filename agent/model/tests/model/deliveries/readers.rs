@@ -142,7 +142,7 @@ fn samples_from_before_a_late_reader_are_neither_delivered_nor_lost() {
 }
 
 #[test]
-fn a_socket_of_an_unknown_participant_takes_no_sample_from_a_known_one() {
+fn a_socket_of_an_unknown_participant_receives_no_sample_of_a_known_one() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411).multicast(101);
     host.owner(bob, BOB);

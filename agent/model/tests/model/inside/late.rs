@@ -197,7 +197,7 @@ fn call_of_a_message() -> LateCall {
 }
 
 #[test]
-fn a_wait_is_divided_by_the_way_of_the_message() {
+fn a_wait_is_divided_by_the_hops_of_the_message() {
     let mut late = call_of_a_message();
     let expected = [
         (Stage::Publish, Cause::Send, 10),
@@ -253,7 +253,7 @@ fn a_callback_before_explains_only_the_time_since_the_message_was_received() {
 }
 
 #[test]
-fn a_stopped_process_is_named_with_who_continued_it() {
+fn a_stopped_call_has_the_thread_that_continued_the_process() {
     let mut late = call_of_a_message();
     late.delivery.as_mut().unwrap().receiver = None;
     // It was stopped before the message arrived, which is 60 ms before the call.

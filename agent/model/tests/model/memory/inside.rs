@@ -129,7 +129,7 @@ fn late(process: u32, now: u64) -> impl Iterator<Item = LateCall> {
 /// Compares the memory of the tables at their caps, with two snapshots and pages, to
 /// [`Limits::INSIDE_BYTES`].
 #[test]
-fn figures_from_inside_processes_fit_into_their_share_of_the_memory_limit() {
+fn figures_from_inside_processes_are_below_their_share_of_the_memory_limit() {
     let _alone = ALONE.lock().unwrap();
     let before = resident();
     let mut observer = Observer::new(Settings::default());

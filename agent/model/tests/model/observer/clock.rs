@@ -75,7 +75,7 @@ fn jumps_of_the_source_clock_by_years_do_not_stop_the_model() {
 }
 
 #[test]
-fn the_same_input_gives_the_same_facts() {
+fn the_same_input_yields_the_same_facts() {
     let replay = || {
         let mut world = World::new(&["/**"]);
         let mut dice = Dice(3);

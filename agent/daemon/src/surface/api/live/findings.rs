@@ -22,7 +22,7 @@ use ros2probe_model::report::snapshot::{EndpointFacts, Snapshot};
 const MAX_FINDINGS: usize = 512;
 
 /// Input of the findings.
-pub(super) struct Circumstances<'a> {
+pub(super) struct FindingInputs<'a> {
     pub(super) snapshot: &'a Snapshot,
     pub(super) agent: &'a AgentFacts,
     pub(super) past: &'a Past,
@@ -32,7 +32,7 @@ pub(super) struct Circumstances<'a> {
 }
 
 /// Returns all findings, the most severe first.
-pub(super) fn findings(circumstances: &Circumstances<'_>) -> Vec<Finding> {
+pub(super) fn findings(circumstances: &FindingInputs<'_>) -> Vec<Finding> {
     let mut list = of_agent(circumstances);
     list.extend(of_graph(circumstances));
     list.extend(measured::of_watches(circumstances));
@@ -81,7 +81,7 @@ pub(super) fn finding(
     }
 }
 
-fn of_agent(all: &Circumstances<'_>) -> Vec<Finding> {
+fn of_agent(all: &FindingInputs<'_>) -> Vec<Finding> {
     let (agent, snapshot) = (all.agent, all.snapshot);
     let mut list = Vec::new();
     if let Some(reason) = all.unready {
@@ -146,7 +146,7 @@ fn unseen(agent: &AgentFacts) -> Vec<Finding> {
         if agent.abilities.contains(&ability) {
             continue;
         }
-        let mut blind = agent.blind.iter();
+        let mut blind = agent.missing_abilities.iter();
         let Some((_, reason)) = blind.find(|(blind, _)| *blind == ability) else {
             lacking.push(object(ability));
             continue;
@@ -192,7 +192,7 @@ pub(super) fn dropped(agent: &AgentFacts) -> u64 {
     packets + agent.records_dropped + agent.pieces_dropped
 }
 
-fn of_graph(all: &Circumstances<'_>) -> Vec<Finding> {
+fn of_graph(all: &FindingInputs<'_>) -> Vec<Finding> {
     let snapshot = all.snapshot;
     let ends = Ends::new(snapshot);
     let list = snapshot.diagnoses.list.iter();
@@ -214,7 +214,7 @@ fn of_graph(all: &Circumstances<'_>) -> Vec<Finding> {
     found.collect()
 }
 
-fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> Finding {
+fn in_words(all: &FindingInputs<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> Finding {
     let kind = diagnosis.kind();
     match diagnosis {
         Diagnosis::QosIncompatible {
@@ -273,7 +273,7 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
         Diagnosis::HangingCall { topic, writer } => {
             let text = format!(
                 "{} calls {} and receives no reply",
-                ends.who(*writer),
+                ends.owner_name(*writer),
                 topic.name
             );
             let about = format!("{}|{}|{writer}", topic.domain_id, topic.dds_name);
@@ -318,12 +318,12 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
             backends,
         } => {
             let why = match reader {
-                Some(reader) => format!("{} takes no buffers", ends.who(*reader)),
+                Some(reader) => format!("{} takes no buffers", ends.owner_name(*reader)),
                 None => "it is transient local".to_owned(),
             };
             let text = format!(
                 "{} sends {} through the CPU instead of {}: {why}",
-                ends.who(*writer),
+                ends.owner_name(*writer),
                 topic.name,
                 backends.join(", ")
             );
@@ -365,7 +365,7 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
             domain_id,
             participants,
         } => {
-            let listed: Vec<_> = participants.iter().map(|guid| ends.who(*guid)).collect();
+            let listed: Vec<_> = participants.iter().map(|guid| ends.owner_name(*guid)).collect();
             let text = format!(
                 "Participants with different addresses have one machine id, so they use only shared \
                  memory with each other: {}",
@@ -411,10 +411,10 @@ fn unmatched(
     ends: &Ends<'_>,
     [verb, counterpart]: [&str; 2],
 ) -> Finding {
-    let (who, why) = (ends.who(endpoint), lacks(reason, counterpart));
+    let (who, why) = (ends.owner_name(endpoint), missing_counterpart(reason, counterpart));
     let text = format!("{who} {verb} {}, and {why}", topic.name);
     let about = format!("{}|{}|{endpoint}", topic.domain_id, topic.dds_name);
-    let found = finding(kind, alone(reason), &about, text);
+    let found = finding(kind, severity_of_unmatched(reason), &about, text);
     match reason {
         "unreachable" => found.with_remedy(
             "on the host with 127.0.0.1, unset ROS_LOCALHOST_ONLY, or set ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET",
@@ -437,8 +437,8 @@ fn incompatible(
         .collect();
     let text = format!(
         "{} sends nothing to {} on {}: {}",
-        ends.who(writer),
-        ends.who(reader),
+        ends.owner_name(writer),
+        ends.owner_name(reader),
         topic.name,
         differ.join("; ")
     );
@@ -453,7 +453,7 @@ fn incompatible(
 }
 
 /// Returns why an endpoint has no counterpart.
-fn lacks(reason: &str, counterpart: &str) -> String {
+fn missing_counterpart(reason: &str, counterpart: &str) -> String {
     match reason {
         "unreachable" => format!(
             "every {counterpart} is on another host, and one of the two announces only 127.0.0.1"
@@ -467,7 +467,7 @@ fn lacks(reason: &str, counterpart: &str) -> String {
 
 /// Returns the severity. An endpoint without any counterpart is common, but an endpoint with only
 /// incompatible counterparts is not.
-fn alone(reason: &str) -> Severity {
+fn severity_of_unmatched(reason: &str) -> Severity {
     match reason {
         "unreachable" | "qos" | "type" | "partition" => Severity::Warning,
         _ => Severity::Note,
@@ -505,7 +505,7 @@ impl<'a> Ends<'a> {
 
     /// Returns the node of an endpoint. If no node announces it, those of its participant are named.
     /// Without these, it is the GUID.
-    fn who(&self, guid: Guid) -> String {
+    fn owner_name(&self, guid: Guid) -> String {
         let endpoint = self.endpoints.get(&guid);
         if let Some(node) = endpoint.and_then(|endpoint| endpoint.node.as_ref()) {
             return node.to_string();
@@ -580,7 +580,7 @@ mod tests {
             }),
             ..Snapshot::default()
         };
-        let found = findings(&Circumstances {
+        let found = findings(&FindingInputs {
             snapshot: &snapshot,
             agent: &AgentFacts::new(SourceKind::Wire, Instant::now()),
             past: &Past::default(),
@@ -619,7 +619,7 @@ mod tests {
             }),
             ..Snapshot::default()
         };
-        let who = |snapshot: &Snapshot| Ends::new(snapshot).who(reader);
+        let who = |snapshot: &Snapshot| Ends::new(snapshot).owner_name(reader);
         assert_eq!(who(&snapshot), "the participant of /lidar");
         snapshot.nodes.push(node("/imu"));
         assert_eq!(who(&snapshot), "the participant of /lidar and /imu");
@@ -688,7 +688,7 @@ mod tests {
             "{lacking:?}"
         );
         let reason = "the kernel is too old".to_owned();
-        agent.blind.push((Ability::SocketLosses, reason));
+        agent.missing_abilities.push((Ability::SocketLosses, reason));
         let both = text(&agent);
         assert_eq!(
             both[0],

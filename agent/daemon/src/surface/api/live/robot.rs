@@ -316,7 +316,7 @@ mod tests {
     }
 
     #[test]
-    fn the_findings_say_what_is_wrong_and_what_helps() {
+    fn findings_have_a_sentence_and_a_remedy() {
         let near = |subscription: TopicKey, difference| Diagnosis::NearMiss {
             topic: topic(0, "/scan"),
             subscription,

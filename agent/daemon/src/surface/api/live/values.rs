@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, HashMap};
 
-use super::super::history::{short, thousandths};
+use super::super::history::{stored_precision, thousandths};
 use super::super::index::Index;
 use super::rate_steps::{Part, RateSteps, STEP_SECONDS, MAX_STEPS};
 use super::structure::{Ids, is_measured, is_shown};
@@ -55,7 +55,7 @@ pub(super) struct Figures<'a> {
     pub(super) past: &'a Past,
     pub(super) watchlist: &'a Watchlist,
     /// Whether messages in shared memory are observed.
-    pub(super) sees_memory: bool,
+    pub(super) observes_shared_memory: bool,
     /// Messages lost in the last [`LOSS_FLAG_SECONDS`] seconds, by the topic's id in the history.
     pub(super) lost: HashMap<u32, u32>,
 }
@@ -83,7 +83,7 @@ impl Figures<'_> {
         };
         let second = known.and_then(|known| last?.row(known));
         let latency = second.and_then(|second| second.latency());
-        let part = |place: usize| latency.and_then(|it| it.get(place).copied()).map(short);
+        let part = |place: usize| latency.and_then(|it| it.get(place).copied()).map(stored_precision);
         let at = measured.last_message;
         Row(
             id,
@@ -155,7 +155,7 @@ impl Figures<'_> {
         mark(Flag::Loss, lost.is_some_and(|lost| *lost > 0));
         let is_unseen = |passage| match passage {
             Transport::Network | Transport::Tcp => false,
-            Transport::SharedMemory => !self.sees_memory,
+            Transport::SharedMemory => !self.observes_shared_memory,
             Transport::DataSharing | Transport::SameProcess | Transport::Iceoryx => true,
         };
         let mut transports = topic.transports.iter();
@@ -210,7 +210,7 @@ pub(super) fn totals(snapshot: &Snapshot, past: &Past) -> Totals {
 }
 
 /// Returns the recently lost messages, by the topic's id in the history.
-pub(super) fn lost_lately(past: &Past) -> HashMap<u32, u32> {
+pub(super) fn recent_losses(past: &Past) -> HashMap<u32, u32> {
     let seconds = past.seconds();
     let first = seconds.len().saturating_sub(LOSS_FLAG_SECONDS);
     let mut lost = HashMap::new();

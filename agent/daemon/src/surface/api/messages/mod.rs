@@ -25,7 +25,7 @@ use utoipa::{IntoParams, ToSchema};
 use super::body_stream::{Pieces, lines_of, stream_of, write_line};
 use super::problem::{Code, Problem, ProblemBody};
 use super::scope::Domain;
-use super::security::Granted;
+use super::security::Rights;
 use super::topics::{TopicParameter, find};
 use super::{Context, Streamed};
 use crate::config::Access;
@@ -168,7 +168,7 @@ pub(super) async fn definition(
 )]
 pub(super) async fn follow(
     context: Context,
-    granted: &Granted,
+    granted: &Rights,
     name: &str,
     wanted: Wanted,
 ) -> Result<Response, Problem> {

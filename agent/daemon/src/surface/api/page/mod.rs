@@ -220,7 +220,7 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
     responses((status = 200, description = "A new token.", body = PageToken))
 )]
 async fn token(State(context): State<Context>) -> Result<Json<PageToken>, Problem> {
-    let token = context.page.tokens.mint();
+    let token = context.page.tokens.create();
     let token = token.map_err(|error| Problem::new(Code::StorageRefuses, error.to_string()))?;
     Ok(Json(PageToken {
         token,

@@ -10,7 +10,7 @@ use utoipa::IntoParams;
 use super::super::Context;
 use super::super::problem::{Code, Problem};
 use super::super::scope::Domain;
-use super::super::turns::{NoResult, in_turn};
+use super::super::turns::{NoResult, run_blocking};
 use super::writer::seconds;
 use ros2probe_history::Store;
 
@@ -30,7 +30,7 @@ const READ_TIMEOUT: Duration = Duration::from_secs(10);
 #[derive(Clone, Copy, Debug, Default, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields, default)]
 #[into_params(parameter_in = Query)]
-pub(in super::super) struct Range {
+pub(in super::super) struct TimeRange {
     /// Unix time of the begin; an hour before `to` by default.
     #[param(example = 1_790_000_000)]
     pub(in super::super) from: Option<f64>,
@@ -73,7 +73,7 @@ pub(in super::super) struct Times {
 
 impl TopicRange {
     /// Returns the domain and, unless only the last minutes are requested, the times.
-    pub(in super::super) fn parts(self) -> (Domain, Option<Range>) {
+    pub(in super::super) fn parts(self) -> (Domain, Option<TimeRange>) {
         let Self {
             domain_id,
             from,
@@ -81,12 +81,12 @@ impl TopicRange {
             step,
         } = self;
         let is_empty = from.is_none() && to.is_none() && step.is_none();
-        let range = (!is_empty).then_some(Range { from, to, step });
+        let range = (!is_empty).then_some(TimeRange { from, to, step });
         (Domain::of(domain_id), range)
     }
 }
 
-impl Range {
+impl TimeRange {
     /// # Errors
     /// Fails if the end is before the begin, or a number is impossible.
     pub(in super::super) fn checked(self, now: u32) -> Result<Times, Problem> {
@@ -148,7 +148,7 @@ pub(in super::super) async fn read_store<T: Send + 'static>(
     if !history.is_kept() {
         return Err(missing(none));
     }
-    let answer = in_turn(&READER_PERMITS, READ_TIMEOUT, move || history.opened().map(read)).await;
+    let answer = run_blocking(&READER_PERMITS, READ_TIMEOUT, move || history.opened().map(read)).await;
     match answer {
         Ok(answer) => answer.ok_or_else(|| missing(none)),
         Err(NoResult::Late) => Err(missing("the storage of the history does not answer")),
@@ -168,7 +168,7 @@ mod tests {
     fn a_range_has_at_most_as_many_rows_as_an_answer_may_have() {
         let range = |from: f64, to: f64, step: Option<u32>| {
             let (from, to) = (Some(from), Some(to));
-            Range { from, to, step }.checked(5_000)
+            TimeRange { from, to, step }.checked(5_000)
         };
         let times = |from, to, step| Times { from, to, step };
         assert_eq!(range(0.0, 600.0, None).unwrap(), times(0, 600, 1));
@@ -178,7 +178,7 @@ mod tests {
             range(0.0, 86_400.0, Some(600)).unwrap(),
             times(0, 86_400, 600)
         );
-        let hour = Range::default().checked(5_000).unwrap();
+        let hour = TimeRange::default().checked(5_000).unwrap();
         assert_eq!(hour, times(1_400, 5_000, 6));
         for (from, to, step) in [
             (600.0, 600.0, None),

@@ -6,11 +6,11 @@ use axum::Json;
 use axum::response::{IntoResponse, Response};
 
 use super::super::Context;
-use super::super::history::{short, thousandths};
+use super::super::history::{stored_precision, thousandths};
 use super::super::problem::{Code, Problem};
 use super::super::scope::Domain;
 use super::super::topics::find;
-use super::query::{self, Range, Times};
+use super::query::{self, TimeRange, Times};
 use super::writer::{seconds, topic_row};
 use ros2probe_api::topics::History;
 use ros2probe_history::{Tier, TopicName, TopicRow, merge_into};
@@ -24,7 +24,7 @@ pub(in super::super) async fn show(
     context: &Context,
     name: &str,
     domain: Domain,
-    range: Range,
+    range: TimeRange,
 ) -> Result<Response, Problem> {
     let times = range.checked(query::now(context))?;
     let state = context.latest.state();
@@ -137,7 +137,7 @@ fn columns(steps: &[TopicRow], times: Times) -> History {
                 interarrival.map(|[_, high]| high),
             ),
         ] {
-            column.push(value.map(short));
+            column.push(value.map(stored_precision));
         }
     }
     view

@@ -163,7 +163,7 @@ impl Minute {
                 let is_kept = self.events.add(&event(log, record));
                 lagged += u64::from(!is_kept);
             }
-            log.overtook(Reader::History, lagged);
+            log.count_overwritten(Reader::History, lagged);
             self.place = batch.last;
             if is_last {
                 return;
@@ -232,7 +232,7 @@ impl Minute {
             end: now,
             content,
         };
-        blocks.push(text(Kind::State, live::whole_state(&self.context)));
+        blocks.push(text(Kind::State, live::initial_lines(&self.context)));
         let EventLines(events) = std::mem::take(&mut self.events);
         if !events.is_empty() {
             blocks.push(text(Kind::Events, events));

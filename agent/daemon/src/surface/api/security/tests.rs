@@ -19,14 +19,14 @@ fn headers(pairs: &[(&str, &str)]) -> HeaderMap {
 }
 
 /// Returns the code of the refusal, if the request is refused.
-fn refusal(door: &Door, pairs: &[(&str, &str)]) -> Option<Code> {
-    let answer = door.let_in(&headers(pairs), Instant::now());
+fn refusal(door: &AccessRules, pairs: &[(&str, &str)]) -> Option<Code> {
+    let answer = door.check_request(&headers(pairs), Instant::now());
     answer.err().map(|problem| problem.code())
 }
 
 /// Returns access rules that grant all rights.
-fn door(kind: Kind) -> Door {
-    Door::new(kind, Granted::new(Access::All, None))
+fn door(kind: Kind) -> AccessRules {
+    AccessRules::new(kind, Rights::new(Access::All, None))
 }
 
 #[test]
@@ -76,7 +76,7 @@ fn refused_requests_do_not_use_up_the_rate_of_admitted_clients() {
             headers(&[("host", "localhost")]),
         ),
     ] {
-        let answered = |headers: &HeaderMap| match door.let_in(headers, now) {
+        let answered = |headers: &HeaderMap| match door.check_request(headers, now) {
             Err(problem) if problem.code() == Code::TooManyRequests => 0,
             _ => 1,
         };
@@ -91,17 +91,17 @@ fn refused_requests_do_not_use_up_the_rate_of_admitted_clients() {
 fn clients_without_a_token_do_not_use_up_the_rate_of_page_tokens() {
     let now = Instant::now();
     let page = page::Shared::default();
-    let token = page.tokens.mint().unwrap();
-    let granted = Granted::new(Access::Watch, None);
-    let door = Door::new(Kind::Loopback(None), granted).with(page);
+    let token = page.tokens.create().unwrap();
+    let granted = Rights::new(Access::Watch, None);
+    let door = AccessRules::new(Kind::Loopback(None), granted).with(page);
     let plain = headers(&[("host", "localhost")]);
     let bearer = format!("Bearer {token}");
     let holder = headers(&[("host", "localhost"), ("authorization", &bearer)]);
-    let answered = (0..5_000).filter(|_| door.let_in(&plain, now).is_ok());
+    let answered = (0..5_000).filter(|_| door.check_request(&plain, now).is_ok());
     assert_eq!(answered.count(), 1_000);
     let answered = (0..370).filter(|_| {
-        let granted = door.let_in(&holder, now);
-        granted.is_ok_and(|granted| granted.is_holder() && granted.access() == Access::All)
+        let granted = door.check_request(&holder, now);
+        granted.is_ok_and(|granted| granted.has_token() && granted.access() == Access::All)
     });
     assert_eq!(answered.count(), 370);
 }
@@ -118,7 +118,7 @@ fn loopback_grants_the_configured_rights_and_socket_and_token_grant_all() {
             assert_eq!(kind.access(loopback), Access::All);
         }
     }
-    let granted = Granted::new(Access::Watch, Some(Path::new("/run/a.sock").into()));
+    let granted = Rights::new(Access::Watch, Some(Path::new("/run/a.sock").into()));
     assert!(granted.require(Access::Read).is_ok() && granted.require(Access::Watch).is_ok());
     let refused = granted.require(Access::All).unwrap_err();
     assert_eq!(refused.code(), Code::NeedsSocket);
@@ -207,9 +207,9 @@ fn a_flood_exceeds_the_rate_limit_until_the_bucket_refills() {
     let later = start + Duration::from_millis(10);
     assert_eq!((0..100).filter(|_| bucket.draw(later)).count(), 5);
     let door = door(Kind::Socket);
-    let refused = |_: &u32| door.let_in(&HeaderMap::new(), start).is_err();
+    let refused = |_: &u32| door.check_request(&HeaderMap::new(), start).is_err();
     assert_eq!((0..2000).filter(refused).count(), 1000);
-    let again = door.let_in(&HeaderMap::new(), start).unwrap_err();
+    let again = door.check_request(&HeaderMap::new(), start).unwrap_err();
     assert_eq!(again.code(), Code::TooManyRequests);
 
     let rested = start + Duration::from_secs(3600);

@@ -78,7 +78,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
 
     /// Sends the reason for the end, and reads until the client closes the connection. Closing with
     /// unread data would reset the connection and might lose the reason.
-    pub(super) async fn say_farewell(
+    pub(super) async fn close_with_reason(
         &mut self,
         code: CloseCode,
         reason: &'static str,

@@ -71,7 +71,7 @@ fn topics_whose_delays_add_up_form_a_chain() {
 }
 
 #[test]
-fn branches_of_one_topic_form_no_chain_even_if_one_always_comes_first() {
+fn branches_of_one_topic_form_no_chain_even_if_one_is_always_first() {
     let chains = recorded(None, |delays| {
         let clean = delays.next(10 * MILLISECOND, 4 * MILLISECOND);
         let map = delays.next(30 * MILLISECOND, 4 * MILLISECOND);
