@@ -26,7 +26,7 @@ pub enum Compression {
 #[derive(Debug, Default)]
 pub struct Progress {
     read: AtomicU64,
-    given_up: AtomicBool,
+    cancelled: AtomicBool,
 }
 
 impl Progress {
@@ -38,13 +38,13 @@ impl Progress {
 
     /// Cancels the compression at its next read; the file stays as it is.
     pub fn cancel(&self) {
-        self.given_up.store(true, Ordering::Relaxed);
+        self.cancelled.store(true, Ordering::Relaxed);
     }
 
     /// Returns whether [`Self::cancel`] was called.
     #[must_use]
     pub fn is_cancelled(&self) -> bool {
-        self.given_up.load(Ordering::Relaxed)
+        self.cancelled.load(Ordering::Relaxed)
     }
 }
 

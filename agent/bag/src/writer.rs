@@ -288,7 +288,7 @@ impl Writer {
     /// [`Self::unwritten`] counts them.
     pub fn settle(&mut self) {
         if matches!(self.current.as_mut().map(FileWriter::flush), Some(Err(_))) {
-            self.give_up_waiting();
+            self.cancel_compression();
         }
     }
 
@@ -323,7 +323,7 @@ impl Writer {
         self.options.custom_data.extend(custom_data);
         let mut refused = None;
         if let Err(error) = self.finish_file() {
-            self.give_up_waiting();
+            self.cancel_compression();
             // Without the summary a file is still readable, and `rp bag reindex` completes it.
             if self.finish_file().is_err() {
                 self.abandon_file();
@@ -473,7 +473,7 @@ impl Writer {
         }
     }
 
-    fn give_up_waiting(&mut self) {
+    fn cancel_compression(&mut self) {
         if let Some(current) = &mut self.current {
             for (channel, (messages, bytes)) in current.discard() {
                 let unwritten = self.unwritten.entry(channel).or_default();

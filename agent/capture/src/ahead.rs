@@ -22,7 +22,7 @@ pub enum ReadyItem {
     /// A record of a complete datagram.
     Record(Record),
     /// The rest of a complete datagram that the kernel filter handed over.
-    Rest(Reassembled),
+    Remainder(Reassembled),
 }
 
 /// Datagrams that are not complete yet.
@@ -31,7 +31,7 @@ pub struct Ahead {
     waiting: HashMap<Token, Waiting>,
     oldest: Bounded<AheadDatagrams, VecDeque<(Timestamp, Token)>>,
     bytes: Sum<AheadBytes>,
-    given_up: u64,
+    discarded: u64,
 }
 
 /// A datagram's source and token.
@@ -41,7 +41,7 @@ type Token = (u32, u32);
 struct Waiting {
     records: Bounded<AheadRecords, Vec<Record>>,
     handed_over: bool,
-    rest: Option<Reassembled>,
+    remainder: Option<Reassembled>,
     /// Time of the frame that completed the datagram.
     complete: Option<u64>,
 }
@@ -78,14 +78,14 @@ impl Ahead {
     }
 
     /// Accepts the rest of a handed-over datagram.
-    pub fn rest(&mut self, namespace: u32, rest: Reassembled, ready: impl FnMut(ReadyItem)) {
+    pub fn add_remainder(&mut self, namespace: u32, rest: Reassembled, ready: impl FnMut(ReadyItem)) {
         let Some(handover) = rest.handover else {
             return;
         };
         let token = (namespace, handover.datagram);
         self.change(token, rest.last_seen, |waiting| {
             waiting.handed_over = true;
-            waiting.rest = Some(rest);
+            waiting.remainder = Some(rest);
         });
         self.complete_datagram(token, ready);
     }
@@ -101,8 +101,8 @@ impl Ahead {
 
     /// Returns the number of datagrams that never became complete or did not fit.
     #[must_use]
-    pub const fn given_up(&self) -> u64 {
-        self.given_up
+    pub const fn discarded(&self) -> u64 {
+        self.discarded
     }
 
     /// Changes the waiting datagram, and gives up the oldest datagrams if a bound is exceeded.
@@ -124,7 +124,7 @@ impl Ahead {
 
     fn discard(&mut self, oldest: Option<(Timestamp, Token)>) {
         if let Some((_, oldest)) = oldest {
-            self.given_up += u64::from(self.remove(oldest).is_some());
+            self.discarded += u64::from(self.remove(oldest).is_some());
         }
     }
 
@@ -139,7 +139,7 @@ impl Ahead {
             return;
         };
         let Some(time) = waiting.complete else { return };
-        if waiting.handed_over && waiting.rest.is_none() {
+        if waiting.handed_over && waiting.remainder.is_none() {
             return;
         }
         let Some(waiting) = self.remove(token) else {
@@ -152,8 +152,8 @@ impl Ahead {
                 ..record
             }));
         }
-        if let Some(rest) = waiting.rest {
-            ready(ReadyItem::Rest(rest));
+        if let Some(rest) = waiting.remainder {
+            ready(ReadyItem::Remainder(rest));
         }
     }
 }
@@ -165,7 +165,7 @@ impl Waiting {
         let Self {
             records,
             handed_over: _,
-            rest,
+            remainder: rest,
             complete: _,
         } = self;
         let rest = rest.as_ref().map_or(0, Reassembled::held_bytes);
@@ -194,7 +194,7 @@ mod tests {
         let mut all = Vec::new();
         ahead.record(0, record, |ready| match ready {
             ReadyItem::Record(record) => all.push(record),
-            ReadyItem::Rest(_) => unreachable!("nothing was handed over"),
+            ReadyItem::Remainder(_) => unreachable!("nothing was handed over"),
         });
         all
     }
@@ -204,7 +204,7 @@ mod tests {
         let mut ahead = Ahead::default();
         assert!(taken(&mut ahead, record(9, kind::DATA, flag::AHEAD, 1)).is_empty());
         ahead.advance(Timestamp(31_000_000_000));
-        assert_eq!(ahead.given_up(), 1);
+        assert_eq!(ahead.discarded(), 1);
         assert!(taken(&mut ahead, record(9, kind::COMPLETE, 0, 2)).is_empty());
     }
 
@@ -254,7 +254,7 @@ mod tests {
         let held: usize = ahead.waiting.values().map(Waiting::bytes).sum();
         assert_eq!(ahead.bytes.used(), held);
         assert_driven::<AheadBytes>();
-        assert_eq!(ahead.given_up(), 999 - ahead.waiting.len() as u64);
+        assert_eq!(ahead.discarded(), 999 - ahead.waiting.len() as u64);
     }
 
     #[test]

@@ -146,7 +146,7 @@ impl FilterReader {
     /// Returns the number of captured datagrams that never became complete.
     #[must_use]
     pub const fn incomplete_datagrams(&self) -> u64 {
-        self.pieces.given_up()
+        self.pieces.discarded()
     }
 
     /// Returns the bytes held for datagrams that are incomplete or wait.

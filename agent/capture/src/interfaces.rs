@@ -157,7 +157,7 @@ impl Interfaces {
         'attempt: for _ in 0..MAX_ATTEMPTS {
             // Waiting messages are older than the list, and messages after them may be lost.
             self.drain(&mut changes)?;
-            self.ask()?;
+            self.request()?;
             let mut listed = BTreeSet::new();
             let mut interrupted = false;
             loop {
@@ -215,7 +215,7 @@ impl Interfaces {
         Err(InterfacesError::Unstable)
     }
 
-    fn ask(&mut self) -> Result<(), InterfacesError> {
+    fn request(&mut self) -> Result<(), InterfacesError> {
         self.sequence = self.sequence.wrapping_add(1);
         let mut request = Vec::with_capacity(32);
         request.extend_from_slice(&32_u32.to_ne_bytes());

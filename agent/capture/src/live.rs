@@ -90,7 +90,7 @@ impl CaptureError {
     /// Returns whether interfaces cannot be observed because a right is missing. A restart does not
     /// help then.
     #[must_use]
-    pub const fn is_for_lack_of_rights(&self) -> bool {
+    pub const fn is_permission_error(&self) -> bool {
         matches!(
             self,
             Self::Neither { .. } | Self::Tap(WireTapError::Interfaces(InterfacesError::Family(_)))
@@ -313,12 +313,12 @@ impl LiveSource {
     }
 
     /// Sets whether a client needs calls inside processes, if they are observed on demand.
-    pub fn want_inside(&self, wanted: bool) {
-        self.inside.iter().for_each(|inside| inside.want(wanted));
+    pub fn request_inside(&self, wanted: bool) {
+        self.inside.iter().for_each(|inside| inside.set_calls_requested(wanted));
     }
 
     /// Sets which calls clients regard as late, and whether one requests their causes.
-    pub fn want_late(&self, demand: &LateDemand) {
+    pub fn request_late_calls(&self, demand: &LateDemand) {
         self.inside
             .iter()
             .for_each(|inside| inside.set_late_demand(demand));
@@ -384,7 +384,7 @@ impl LiveSource {
         if (self.host.is_some() || self.exact.is_some()) && woken {
             // Packets arrive in bursts. After a timeout, packets have already had time to
             // accumulate.
-            std::thread::sleep(if observer.wants_payloads() {
+            std::thread::sleep(if observer.needs_payloads() {
                 PAYLOAD_READ_INTERVAL
             } else {
                 READ_INTERVAL
@@ -467,23 +467,23 @@ impl LiveSource {
             return;
         }
         self.last_requests_passed = now;
-        self.want(observer);
+        self.apply_requests(observer);
     }
 
-    fn want(&self, observer: &Observer) {
+    fn apply_requests(&self, observer: &Observer) {
         let wanted = observer.wanted_of_shared_memory();
         if let Shm::Running(shared_memory) = &self.shared_memory {
-            shared_memory.want(wanted);
+            shared_memory.set_need(wanted);
         }
         if let Some(exact) = &self.exact {
-            exact.want(wanted == Wanted::EverySample);
+            exact.set_demand(wanted == Wanted::EverySample);
         }
     }
 
     /// Passes the model's requests for shared memory to its readers immediately. Returns whether
     /// the programs that read every sample are still being attached.
     pub fn is_attaching(&self, observer: &Observer) -> bool {
-        self.want(observer);
+        self.apply_requests(observer);
         self.exact.as_ref().is_some_and(Uprobe::is_attaching)
     }
 

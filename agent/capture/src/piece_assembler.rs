@@ -23,7 +23,7 @@ const PIECE_LIFETIME_NANOSECONDS: u64 = 10_000_000_000;
 #[derive(Debug, Default)]
 pub struct PieceAssembler {
     open: Bounded<OpenPieces, VecDeque<Open>>,
-    given_up: u64,
+    discarded: u64,
     /// Empty buffers for reuse. In a new buffer, the kernel would have to clear each page.
     free_buffers: Vec<Vec<u8>>,
     /// Time of the latest datagram in several pieces, in the kernel's clock.
@@ -54,7 +54,7 @@ impl PieceAssembler {
             // The token is reused, so the remaining pieces of the other datagram are lost.
             self.discard(open);
             if !fits {
-                self.given_up += 1;
+                self.discarded += 1;
                 return None;
             }
             if piece.len == piece.datagram_len {
@@ -68,7 +68,7 @@ impl PieceAssembler {
                 first: *piece,
                 bytes: buffer,
             });
-            self.given_up += u64::from(oldest.is_some());
+            self.discarded += u64::from(oldest.is_some());
             return None;
         }
         // The first piece was discarded or never arrived.
@@ -102,13 +102,13 @@ impl PieceAssembler {
         let before = self.open.len();
         self.open
             .retain(|open| now.saturating_sub(open.first.time) < LIFETIME_NANOSECONDS);
-        self.given_up += (before - self.open.len()) as u64;
+        self.discarded += (before - self.open.len()) as u64;
     }
 
     /// Returns the number of datagrams that never became complete.
     #[must_use]
-    pub const fn given_up(&self) -> u64 {
-        self.given_up
+    pub const fn discarded(&self) -> u64 {
+        self.discarded
     }
 
     /// Returns the bytes of incomplete datagrams, and of buffers for reuse.
@@ -120,7 +120,7 @@ impl PieceAssembler {
 
     fn discard(&mut self, index: Option<usize>) {
         if index.and_then(|index| self.open.remove(index)).is_some() {
-            self.given_up += 1;
+            self.discarded += 1;
         }
     }
 }
@@ -194,7 +194,7 @@ mod tests {
             }
         }
         assert_eq!(complete, [1, 2]);
-        assert_eq!((wholes.bytes(), wholes.given_up()), (0, 0));
+        assert_eq!((wholes.bytes(), wholes.discarded()), (0, 0));
     }
 
     #[test]
@@ -204,15 +204,15 @@ mod tests {
         assert!(wholes.piece(&all[0].0, &all[0].1).is_none());
         // The second piece is lost.
         assert!(wholes.piece(&all[2].0, &all[2].1).is_none());
-        assert_eq!((wholes.bytes(), wholes.given_up()), (0, 1));
+        assert_eq!((wholes.bytes(), wholes.discarded()), (0, 1));
         assert!(wholes.piece(&all[0].0, &all[0].1).is_none());
         wholes.advance(LIFETIME_NANOSECONDS);
-        assert_eq!(wholes.given_up(), 1);
+        assert_eq!(wholes.discarded(), 1);
         wholes.advance(LIFETIME_NANOSECONDS + 1);
-        assert_eq!((wholes.bytes(), wholes.given_up()), (0, 2));
+        assert_eq!((wholes.bytes(), wholes.discarded()), (0, 2));
         // A piece that arrives later is ignored.
         assert!(wholes.piece(&all[1].0, &all[1].1).is_none());
-        assert_eq!(wholes.given_up(), 2);
+        assert_eq!(wholes.discarded(), 2);
     }
 
     #[test]
@@ -223,7 +223,7 @@ mod tests {
         assert!(wholes.piece(&new[0].0, &new[0].1).is_none());
         let (_, whole) = wholes.piece(&new[1].0, &new[1].1).unwrap();
         assert_eq!(whole, content(1, 0, 20_000));
-        assert_eq!(wholes.given_up(), 1);
+        assert_eq!(wholes.discarded(), 1);
     }
 
     #[test]
@@ -234,7 +234,7 @@ mod tests {
             assert!(wholes.piece(&all[0].0, &all[0].1).is_none());
         }
         assert_driven::<OpenPieces>();
-        assert_eq!(wholes.given_up(), 1000 - wholes.open.len() as u64);
+        assert_eq!(wholes.discarded(), 1000 - wholes.open.len() as u64);
     }
 
     proptest! {

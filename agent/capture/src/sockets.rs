@@ -33,7 +33,7 @@ pub struct Sockets {
     groups: CgroupPaths,
     known: BTreeMap<u64, Known>,
     last_search: u64,
-    asked: u64,
+    last_request: u64,
     failed: bool,
 }
 
@@ -56,7 +56,7 @@ impl Sockets {
             groups: CgroupPaths::new(hierarchy),
             known: BTreeMap::new(),
             last_search: 0,
-            asked: 0,
+            last_request: 0,
             failed: false,
         }
     }
@@ -122,11 +122,11 @@ impl Sockets {
             let known = self.known.get(cookie);
             known.is_none_or(|known| known.owner.is_none() && known.requests < MAX_REQUESTS)
         };
-        let due = now.saturating_sub(self.asked) >= FULL_SEARCH_INTERVAL;
+        let due = now.saturating_sub(self.last_request) >= FULL_SEARCH_INTERVAL;
         if met.is_empty() || !(due || met.keys().any(unknown)) {
             return None;
         }
-        self.asked = now;
+        self.last_request = now;
         let found = owners.refresh(&met.keys().copied().collect());
         if let Err(error) = &found
             && !self.failed

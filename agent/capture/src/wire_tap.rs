@@ -263,7 +263,7 @@ impl WireTap {
     #[must_use]
     pub const fn incomplete_datagrams(&self) -> u64 {
         let reassembly = self.frames.reassembly.counters();
-        self.frames.ahead.given_up() + reassembly.evicted + reassembly.timed_out
+        self.frames.ahead.discarded() + reassembly.evicted + reassembly.timed_out
     }
 
     /// Returns the bytes held for reassembly.
@@ -434,7 +434,7 @@ impl FrameAssembly {
                 );
                 if let Some(rest) = self.reassembly.hand_over(at, key, &record) {
                     let ready = |each| deliver_ready(each, observer);
-                    self.ahead.rest(self.number, rest, ready);
+                    self.ahead.add_remainder(self.number, rest, ready);
                 }
             }
             let ready = |each| deliver_ready(each, observer);
@@ -519,7 +519,7 @@ impl FrameAssembly {
                 };
                 if whole.handover.is_some() {
                     let ready = |each| deliver_ready(each, observer);
-                    self.ahead.rest(self.number, whole, ready);
+                    self.ahead.add_remainder(self.number, whole, ready);
                 } else {
                     (envelope.source_port, envelope.destination_port) =
                         (whole.source_port, whole.destination_port);
@@ -567,11 +567,11 @@ fn decode_frame(
 fn deliver_ready(ready: ReadyItem, observer: &mut Observer) {
     match ready {
         ReadyItem::Record(record) => observe(observer, &record),
-        ReadyItem::Rest(rest) => decode_rest(&rest, observer),
+        ReadyItem::Remainder(rest) => decode_remainder(&rest, observer),
     }
 }
 
-fn decode_rest(rest: &Reassembled, observer: &mut Observer) {
+fn decode_remainder(rest: &Reassembled, observer: &mut Observer) {
     let Some(record) = rest.handover else { return };
     let envelope = Envelope::of_handover(&record, rest.last_seen);
     observer.input(Input::Datagram {

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use anyhow::{Context as _, Result, bail};
 use ros2probe::discover::announcements::Announcements;
-use ros2probe::discover::participants::{HeardParticipant, Listening, listen};
+use ros2probe::discover::participants::{FoundParticipant, Listening, listen};
 use ros2probe::discover::session::{MAX_PACKETS, Session, Target};
 use ros2probe::discover::{run_session, local_participant};
 use ros2probe_daemon::agent::configuration;
@@ -67,7 +67,7 @@ pub(crate) fn discover(options: &Discover) -> Result<()> {
     Ok(())
 }
 
-fn describe(participant: &HeardParticipant) -> String {
+fn describe(participant: &FoundParticipant) -> String {
     let mut words = format!(
         "{}  domain {}, {}",
         participant.prefix, participant.domain_id, participant.vendor

@@ -304,7 +304,7 @@ pub fn run(options: Options) -> Result<()> {
         let started = remote_write::start(settings, inputs, privilege::spawn_export);
         exporters.push(started.context("remote write cannot start")?);
     }
-    let powerless = give_up()?;
+    let powerless = drop_privileges()?;
     report_listeners(server.as_ref(), &control, viewers.as_ref(), &watches);
 
     let mut observer = Observer::new(settings(&config, options.replay.is_none()));
@@ -589,7 +589,7 @@ fn listeners(config: &Config, sources: &MetricSources) -> Result<(Option<Server>
 }
 
 /// Drops the privileges of this thread, and verifies that none is left.
-fn give_up() -> Result<Unprivileged> {
+fn drop_privileges() -> Result<Unprivileged> {
     privilege::confine(Role::Service)?;
     let powerless = Unprivileged::verify()?;
     if let Sandbox::Unfiltered(reason) = privilege::sandbox() {

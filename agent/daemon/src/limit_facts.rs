@@ -141,7 +141,7 @@ impl LimitFigures {
     #[must_use]
     pub fn degraded(&self, state: &State) -> Option<String> {
         let all = self.facts(state).into_iter();
-        let reached = all.filter(|facts| facts.at_limit && facts.limit.blinds());
+        let reached = all.filter(|facts| facts.at_limit && facts.limit.hides_data());
         let reached = reached.map(|facts| {
             let LimitFacts {
                 limit, cap, used, ..

@@ -37,7 +37,7 @@ pub struct SnapshotCell {
     /// Number of further seconds that are published for a reader of the last seconds.
     past_wanted: AtomicU8,
     /// Whether a reader waits for a newer state.
-    asked: AtomicBool,
+    requested: AtomicBool,
     /// Whether the state was read since [`Self::was_snapshot_read`].
     read: AtomicBool,
     /// Time at which a client last needed calls inside processes.
@@ -112,7 +112,7 @@ impl SnapshotCell {
             }),
             past: ArcSwap::default(),
             past_wanted: AtomicU8::new(0),
-            asked: AtomicBool::new(false),
+            requested: AtomicBool::new(false),
             read: AtomicBool::new(false),
             calls_wanted: ArcSwapOption::empty(),
             late_wanted: Mutex::default(),
@@ -129,7 +129,7 @@ impl SnapshotCell {
             agent,
         });
         self.state.store(Arc::clone(&state));
-        self.asked.store(false, Ordering::Relaxed);
+        self.requested.store(false, Ordering::Relaxed);
         self.publication.notify_waiters();
         state
     }
@@ -256,8 +256,8 @@ impl SnapshotCell {
 
     /// Returns whether a reader waits for a newer state.
     #[must_use]
-    pub fn is_asked(&self) -> bool {
-        self.asked.load(Ordering::Relaxed)
+    pub fn is_requested(&self) -> bool {
+        self.requested.load(Ordering::Relaxed)
     }
 
     /// Returns the bell of the capture thread.
@@ -273,7 +273,7 @@ impl SnapshotCell {
         if self.state.load().agent.finished {
             return;
         }
-        self.asked.store(true, Ordering::Relaxed);
+        self.requested.store(true, Ordering::Relaxed);
         self.bell.ring();
         // After a timeout, the latest state is shown with its age.
         let _ = tokio::time::timeout(timeout, publication).await;
@@ -443,7 +443,7 @@ mod tests {
         assert!(futures_util::poll!(&mut publication).is_pending());
         cell.refresh(Duration::ZERO).await;
         cell.publish_agent(at(3));
-        assert!(futures_util::poll!(&mut publication).is_pending() && cell.is_asked());
+        assert!(futures_util::poll!(&mut publication).is_pending() && cell.is_requested());
         let own = cell.own_state();
         assert_eq!((own.known().records, own.agent.collected_at), (7, at(3).collected_at));
         assert!(!cell.was_snapshot_read(), "the snapshot was not read");
@@ -457,7 +457,7 @@ mod tests {
     async fn a_refresh_waits_for_the_next_state_up_to_its_timeout() {
         let cell = SnapshotCell::new(SourceKind::Wire);
         let writer = async {
-            while !cell.is_asked() {
+            while !cell.is_requested() {
                 tokio::task::yield_now().await;
             }
             cell.publish(
@@ -466,7 +466,7 @@ mod tests {
             );
         };
         tokio::join!(cell.refresh(Duration::from_secs(3600)), writer);
-        assert!(cell.state().snapshot.is_some() && !cell.is_asked());
+        assert!(cell.state().snapshot.is_some() && !cell.is_requested());
         cell.refresh(Duration::from_millis(1)).await;
     }
 
@@ -533,6 +533,6 @@ mod tests {
         }
         assert!(rings());
         cell.bell().silence();
-        assert!(!rings() && cell.is_asked());
+        assert!(!rings() && cell.is_requested());
     }
 }

@@ -135,7 +135,7 @@ pub enum NotFound {
          --definitions",
         name.package()
     )]
-    Another {
+    OtherDefinition {
         /// Name of the type.
         name: TypeName,
         /// Source of the first definition found.
@@ -277,7 +277,7 @@ impl Library {
             Err(failure) => failure,
         };
         Err(match (failure, reason) {
-            (NotSent::Another(found), NotFound::Nowhere { .. }) => NotFound::Another {
+            (NotSent::Another(found), NotFound::Nowhere { .. }) => NotFound::OtherDefinition {
                 name: name.clone(),
                 location: "that a node described".to_owned(),
                 found,
@@ -617,7 +617,7 @@ mod tests {
         let deep = NotClosed::TooDeep;
         assert!(matches!(failure, NotFound::Refused { reason, .. } if reason == deep));
         let failure = library.find("a/msg/T20", Some(&announced)).unwrap_err();
-        assert!(matches!(failure, NotFound::Another { .. }), "{failure}");
+        assert!(matches!(failure, NotFound::OtherDefinition { .. }), "{failure}");
         assert_eq!(
             library
                 .find("a/msg/T20", None)

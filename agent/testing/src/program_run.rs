@@ -106,7 +106,7 @@ impl Kernel {
     }
 
     /// Returns records that user space read from handed-over datagrams since the last call.
-    pub fn take_rest(&mut self) -> Vec<Record> {
+    pub fn take_remainder(&mut self) -> Vec<Record> {
         std::mem::take(&mut self.rest)
     }
 
@@ -128,18 +128,18 @@ impl Kernel {
             if record.kind == kind::HANDOVER {
                 let key = FlowKey::of_handover(0, &record);
                 if let Some(rest) = self.reassembly.hand_over(Timestamp(self.now), key, &record) {
-                    self.ahead.rest(0, rest, |each| ready.push(each));
+                    self.ahead.add_remainder(0, rest, |each| ready.push(each));
                 }
             }
             self.ahead.record(0, record, |each| ready.push(each));
         }
         let mut records = Vec::new();
-        let rest_came = ready.iter().any(|each| matches!(each, ReadyItem::Rest(_)));
+        let rest_came = ready.iter().any(|each| matches!(each, ReadyItem::Remainder(_)));
         for each in ready {
             match each {
                 ReadyItem::Record(record) if rest_came => self.rest.push(record),
                 ReadyItem::Record(record) => records.push(record),
-                ReadyItem::Rest(rest) => {
+                ReadyItem::Remainder(rest) => {
                     let handover = rest.handover.map(|record| record.handover());
                     let envelope = Envelope::default();
                     walk::datagram(rest.payload(), &envelope, handover.as_ref(), |found| {
@@ -184,7 +184,7 @@ impl Kernel {
             let key = FlowKey::new(0, INTERFACE, false, &parsed, fragment);
             let whole = self.reassembly.fragment(Timestamp(self.now), key, fragment);
             if let Some(rest) = whole.filter(|whole| whole.handover.is_some()) {
-                self.ahead.rest(0, rest, |each| ready.push(each));
+                self.ahead.add_remainder(0, rest, |each| ready.push(each));
             }
         }
     }

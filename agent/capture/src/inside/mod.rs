@@ -185,7 +185,7 @@ impl Inside {
     }
 
     /// Sets whether a client needs calls. The setting matters only if calls are observed on demand.
-    pub fn want(&self, wanted: bool) {
+    pub fn set_calls_requested(&self, wanted: bool) {
         let shared = &self.shared;
         let is_on_demand = shared.facts().is_on_demand;
         if is_on_demand && shared.wanted.swap(wanted, Ordering::AcqRel) != wanted {

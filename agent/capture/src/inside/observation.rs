@@ -318,7 +318,7 @@ impl Observation {
             return;
         }
         // A broker that does not answer is reported in the next round.
-        let met: Result<(), BrokerError> = self.processes.meet(&new, &mut self.broker);
+        let met: Result<(), BrokerError> = self.processes.inspect_mapped(&new, &mut self.broker);
         if met.is_ok() {
             let to_calls = !self.is_resting && self.suspended_at.is_none();
             let now = Instant::now();

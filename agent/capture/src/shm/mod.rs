@@ -195,9 +195,9 @@ impl SharedMemory {
     }
 
     /// Sets the current need, which determines how often the thread polls.
-    pub fn want(&self, wanted: Wanted) {
+    pub fn set_need(&self, wanted: Wanted) {
         let need = match wanted {
-            Wanted::Nothing => Need::Nothing,
+            Wanted::Nothing => Need::Unneeded,
             Wanted::Names => Need::Names,
             Wanted::Samples => Need::Watching,
             Wanted::EverySample => Need::Every,
@@ -315,7 +315,7 @@ fn poll(
                 .find(|need| *need as u8 == wanted)
                 .unwrap_or(Need::Names)
         } else {
-            Need::Nothing
+            Need::Unneeded
         };
         if tap.take_discovery_seen() {
             interval.announcement_read(at);

@@ -23,7 +23,7 @@ const ACCOUNT_INTERVAL: f64 = 0.1;
 /// Sleep during discovery while the credit is full: each participant announces its names once, and
 /// reuses the buffer some 50 us later. Short sleeps see more than busy polling: the scheduler
 /// prefers threads that wake up.
-const MEETING_SLEEP: f64 = 10e-6;
+const CLOSE_POLL_SLEEP: f64 = 10e-6;
 /// Maximum sleep during discovery, at the end of the credit.
 const DISCOVERY_LIMIT_SLEEP: f64 = 500e-6;
 /// Time of busy polling after each announcement, and of the shortest sleeps after each message that
@@ -52,7 +52,7 @@ const MAX_SLEEP: f64 = 50e-3;
 pub enum Need {
     /// No topic that may use shared memory is measured, and no name is missing. New participants
     /// are noticed.
-    Nothing,
+    Unneeded,
     /// No topic is measured; node names and endpoints may be announced.
     Names,
     /// A topic is measured.
@@ -63,7 +63,7 @@ pub enum Need {
 
 impl Need {
     /// Every need, in ascending order.
-    pub const ALL: [Self; 4] = [Self::Nothing, Self::Names, Self::Watching, Self::Every];
+    pub const ALL: [Self; 4] = [Self::Unneeded, Self::Names, Self::Watching, Self::Every];
 }
 
 /// Shares of a CPU, 0.015 for 1.5 %.
@@ -103,7 +103,7 @@ impl PollInterval {
     pub const fn new(budget: Budget) -> Self {
         Self {
             budget,
-            need: Need::Nothing,
+            need: Need::Unneeded,
             sleep: WATCHING_SLEEP,
             stretch: 1.0,
             quiet_since: 0.0,
@@ -164,7 +164,7 @@ impl PollInterval {
             // The start of a whole robot uses up the credit slowly. A robot repeats its names: each
             // participant sends them to every later one.
             let rest = self.credit / MAX_CREDIT;
-            self.sleep = (MEETING_SLEEP / rest.powi(4)).min(DISCOVERY_LIMIT_SLEEP);
+            self.sleep = (CLOSE_POLL_SLEEP / rest.powi(4)).min(DISCOVERY_LIMIT_SLEEP);
             return Duration::from_secs_f64(self.sleep);
         }
         self.close_until = now;
@@ -181,7 +181,7 @@ impl PollInterval {
             return self.short_sleep(now, cpu, found);
         }
         let longest = match need {
-            Need::Nothing => UNNEEDED_SLEEP,
+            Need::Unneeded => UNNEEDED_SLEEP,
             _ if now - self.quiet_since > QUIET_AFTER => QUIET_SLEEP,
             Need::Names => DISCOVERY_SLEEP,
             Need::Watching | Need::Every => WATCHING_SLEEP,
@@ -240,7 +240,7 @@ impl PollInterval {
         let share = (cpu - used) / elapsed;
         let budget = match self.need {
             Need::Every => self.budget.every,
-            Need::Nothing | Need::Names | Need::Watching => self.budget.watching,
+            Need::Unneeded | Need::Names | Need::Watching => self.budget.watching,
         };
         // The tap wakes up less often by the factor of the excess, but gradually.
         let wanted = share / budget;
@@ -314,7 +314,7 @@ mod tests {
             let mut interval = PollInterval::new(BUDGET);
             run(&mut interval, 20.0, 5e-6, need, |_| 0).1
         };
-        assert!((9.0..11.0).contains(&polls(Need::Nothing)));
+        assert!((9.0..11.0).contains(&polls(Need::Unneeded)));
         assert!((90.0..110.0).contains(&polls(Need::Watching)));
         assert!((90.0..110.0).contains(&polls(Need::Names)));
     }
@@ -324,7 +324,7 @@ mod tests {
         let mut interval = PollInterval::new(BUDGET);
         interval.participant_starting(100.0);
         let microseconds = |interval: &mut PollInterval, now, cpu| {
-            interval.sleep(now, cpu, 0, Need::Nothing).as_micros()
+            interval.sleep(now, cpu, 0, Need::Unneeded).as_micros()
         };
         assert_eq!(microseconds(&mut interval, 100.01, 0.0), 10);
         assert_eq!(microseconds(&mut interval, 100.2, 0.0), 10);

@@ -48,7 +48,7 @@ impl Search {
                 true => self.begin(is_port),
                 false => Assessment::Other,
             };
-            return self.settled(match looks {
+            return self.after_search(match looks {
                 Assessment::Zenoh(_) | Assessment::Rtps(_) | Assessment::Undecided if !is_whole => Assessment::Other,
                 looks => looks,
             });
@@ -60,16 +60,16 @@ impl Search {
         }
         let looks = self.assess(is_port);
         if was_empty || !matches!(looks, Assessment::Other) {
-            return self.settled(looks);
+            return self.after_search(looks);
         }
         // The collected bytes began within a batch: this segment may begin with one.
         self.held.take();
         self.held.extend_from_slice(bytes);
         let looks = self.assess(is_port);
-        self.settled(looks)
+        self.after_search(looks)
     }
 
-    fn settled(&mut self, looks: Assessment) -> Assessment {
+    fn after_search(&mut self, looks: Assessment) -> Assessment {
         if matches!(looks, Assessment::Other) {
             self.held.take();
         }

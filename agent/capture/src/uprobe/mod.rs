@@ -123,7 +123,7 @@ pub struct Uprobe {
 
 impl Uprobe {
     /// Loads the programs, and attaches them to installed libraries. With `on_demand`, they are
-    /// detached while no process starts and [`Self::want`] does not need them. `cgroup` restricts
+    /// detached while no process starts and [`Self::set_demand`] does not need them. `cgroup` restricts
     /// them to processes of this control group. `broker` is the socket of the process that attaches
     /// them.
     ///
@@ -175,8 +175,8 @@ impl Uprobe {
 
     /// Sets whether every sample of a writer that may use shared memory is needed. The setting
     /// matters only if programs are attached on demand.
-    pub fn want(&self, wanted: bool) {
-        self.search.want(wanted);
+    pub fn set_demand(&self, wanted: bool) {
+        self.search.set_demand(wanted);
     }
 
     /// Returns whether the programs are needed, but not yet attached in all processes that can have

@@ -159,7 +159,7 @@ impl Processes {
     ///
     /// # Errors
     /// Fails if the broker cannot be reached.
-    pub(crate) fn meet(
+    pub(crate) fn inspect_mapped(
         &mut self,
         new: &NewMappings,
         broker: &mut Broker,

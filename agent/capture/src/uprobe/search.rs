@@ -80,7 +80,7 @@ struct Shared {
 
 impl Facts {
     /// Returns the facts while probes are attached on demand and not needed.
-    fn resting() -> Self {
+    fn idle() -> Self {
         Self {
             libraries: Vec::new(),
             uncovered: Some(IDLE_REASON.to_owned()),
@@ -154,7 +154,7 @@ impl LibrarySearch {
 
     /// Sets whether every message is needed. The setting matters only if probes are attached on
     /// demand.
-    pub fn want(&self, wanted: bool) {
+    pub fn set_demand(&self, wanted: bool) {
         let shared = &self.shared;
         if !shared.on_demand || shared.wanted.swap(wanted, Ordering::AcqRel) == wanted {
             return;
@@ -229,7 +229,7 @@ fn follow(shared: &Shared, attachments: Attachments<Attached>, scope: Scope, bro
         if !shared.wanted.load(Ordering::Acquire) && !is_starting {
             if shared.attached.load(Ordering::Acquire) {
                 // Polling of shared memory resumes before the probes are detached.
-                shared.report(Facts::resting());
+                shared.report(Facts::idle());
                 std::thread::sleep(DETACH_OVERLAP);
                 followed.detach_all();
                 shared.attached.store(false, Ordering::Release);
@@ -237,7 +237,7 @@ fn follow(shared: &Shared, attachments: Attachments<Attached>, scope: Scope, bro
             }
             somebody_came = true;
             asked_all = None;
-            followed.wait_idle(shared);
+            followed.wait_for_demand(shared);
             continue;
         }
         shared.attached.store(true, Ordering::Release);
@@ -327,7 +327,7 @@ impl Followed {
     }
 
     /// Waits until a process maps a library, or every message is needed.
-    fn wait_idle(&mut self, shared: &Shared) {
+    fn wait_for_demand(&mut self, shared: &Shared) {
         let bell = shared.bell.iter().map(Bell::descriptor);
         let mapped = self.mappings.iter().flat_map(MappingEvents::descriptors);
         let descriptors: Vec<_> = bell.chain(mapped).collect();
@@ -385,7 +385,7 @@ impl Followed {
         if self.processes.are_in_scope(&new.processes) {
             self.starting_until = Instant::now() + STARTUP_TIME;
         }
-        if let Err(error) = self.processes.meet(&new, &mut self.broker) {
+        if let Err(error) = self.processes.inspect_mapped(&new, &mut self.broker) {
             self.failed = Some(in_words(&error));
         } else if !new.is_incomplete && new.processes.is_empty() {
             std::thread::sleep(UNRELATED_DELAY);

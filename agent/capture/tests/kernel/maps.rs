@@ -24,7 +24,7 @@ const LISTINGS: usize = 20;
 #[test]
 fn tables_of_tracepoints_and_uprobes_are_allocated_beforehand() -> Result<()> {
     harness::require()?;
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let mut filter = Filter::load_host(&FilterSettings::default())?;
     filter.attach(&File::open(host.cgroup())?)?;
     filter.attach_tracepoints(false);

@@ -88,7 +88,7 @@ impl Observed {
             filter.set_unknown_budget(Budget::CaptureBytes, bytes)?;
         }
         filter.attach(&File::open(cgroup.path())?)?;
-        let host = Namespace::alone()?;
+        let host = Namespace::isolated()?;
         Ok(Self {
             cgroup,
             filter,

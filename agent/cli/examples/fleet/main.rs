@@ -76,7 +76,7 @@ async fn fleet(options: &Options) -> Result<()> {
         "{name} is missing: run `make fleet`, which builds it"
     );
     let directory = tempfile::tempdir().context("cannot create a directory")?;
-    let centre = Namespace::alone()?;
+    let centre = Namespace::isolated()?;
     println!("starting the centre: Prometheus, Alertmanager, VictoriaMetrics");
     let _engines = engines(&centre, directory.path())?;
     let mut relays = Vec::new();

@@ -130,7 +130,7 @@ impl Row {
                 ),
             );
         }
-        let more = self.beside_nobody(Observer::Host);
+        let more = self.without_observer(Observer::Host);
         if self.is_large() && more > targets.of_workload {
             miss(
                 false,
@@ -181,7 +181,7 @@ impl Row {
 
     /// Returns the CPU time of all processes, as a fraction of that without an observer. It
     /// includes the observer's work in the kernel on behalf of other processes.
-    fn beside_nobody(&self, observer: Observer) -> f64 {
+    fn without_observer(&self, observer: Observer) -> f64 {
         let median = |who| median(self.of(who).map(|window| window.workload));
         median(observer) / median(Observer::None)
     }
@@ -233,7 +233,7 @@ impl fmt::Display for Row {
             megabytes(Observer::Wire),
             megabytes(Observer::Subscriber),
             self.each(|window| window.workload),
-            self.beside_nobody(Observer::Host),
+            self.without_observer(Observer::Host),
             self.each(|window| window.machine),
             self.copied(Observer::Host),
             self.copied(Observer::Wire),

@@ -10,7 +10,7 @@ use ros2probe::discover::zenoh::graph::{DomainGraph, EndpointKind};
 use ros2probe::discover::zenoh::session::Step;
 use ros2probe::discover::zenoh::{Answer, connect, run_conversation, plan};
 use ros2probe_daemon::agent::configuration;
-use ros2probe_daemon::privilege::{Role, give_up};
+use ros2probe_daemon::privilege::{Role, drop_capabilities};
 
 use crate::cli::Discover;
 
@@ -28,7 +28,7 @@ const ENDPOINT_KINDS: [(EndpointKind, &str, &str); 4] = [
 pub(super) fn discover(address: &RouterAddress, options: &Discover) -> Result<()> {
     let unseen = unobserved_reason();
     // A connection needs no capability.
-    give_up(Role::Export)?;
+    drop_capabilities(Role::Export)?;
     let mut out = stdout().lock();
     let will = if options.dry_run { "would" } else { "will" };
     writeln!(

@@ -173,7 +173,7 @@ impl Observation {
     pub fn health(&mut self, health: &Health) {
         self.dropped = health.dropped();
         for limit in &health.limits {
-            let known = Limit::find(&limit.limit).filter(|known| known.blinds());
+            let known = Limit::find(&limit.limit).filter(|known| known.hides_data());
             if let Some(known) = known.filter(|_| limit.reached > 0) {
                 self.reached.insert(known.key(), limit.reached);
             }

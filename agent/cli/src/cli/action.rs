@@ -80,14 +80,14 @@ struct Find {
 }
 
 impl Action {
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         match self.verb {
             None => super::help(&["action"]),
             Some(Verb::List(list)) => list.ask(),
             Some(Verb::Info(info)) => info.ask(),
             Some(Verb::Type(kind)) => kind.ask(),
             Some(Verb::Find(find)) => find.ask(),
-            Some(Verb::Echo(echo)) => echo.ask(),
+            Some(Verb::Echo(echo)) => echo.run(),
         }
     }
 }

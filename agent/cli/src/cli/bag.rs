@@ -91,11 +91,11 @@ impl Bag {
         }
     }
 
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         match self.verb {
             None => super::help(&["bag"]),
-            Some(Verb::Record(record)) => record.ask(),
-            Some(Verb::Convert(convert)) => convert.ask(),
+            Some(Verb::Record(record)) => record.run(),
+            Some(Verb::Convert(convert)) => convert.run(),
             Some(Verb::Info(info)) => info.ask(),
             Some(Verb::Reindex(reindex)) => reindex.ask(),
         }

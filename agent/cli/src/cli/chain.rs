@@ -51,7 +51,7 @@ pub(crate) struct Chain {
 }
 
 impl Chain {
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         if let Some(path) = self.target.replay.as_deref().filter(|path| is_bag(path)) {
             return self.of_bag(path);
         }

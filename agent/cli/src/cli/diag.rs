@@ -45,7 +45,7 @@ pub(crate) struct Diag {
 type Key = (String, String, String);
 
 impl Diag {
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         let compile = |pattern: &String| {
             Regex::new(pattern).map_err(|_| {
                 UserError(format!("`{pattern}` is not a supported regular expression"))

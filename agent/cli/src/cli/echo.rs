@@ -90,7 +90,7 @@ pub(crate) struct Echo {
 }
 
 impl Echo {
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         let options = self.options()?;
         let name = full_name(&self.topic_name).map_err(user_error)?;
         if self.lost_messages {

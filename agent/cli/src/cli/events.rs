@@ -61,7 +61,7 @@ const ACTION_PARTS: [(&str, &str); 5] = [
 ];
 
 impl ServiceEcho {
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         let name = full_name(&self.service_name).map_err(user_error)?;
         let events = format!("{name}/_service_event");
         let domain_id = self.target.domain()?;
@@ -98,7 +98,7 @@ impl ServiceEcho {
 }
 
 impl ActionEcho {
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         let parts = selected_parts(self.interfaces.as_deref()).map_err(user_error)?;
         let name = full_name(&self.action_name).map_err(user_error)?;
         let domain_id = self.target.domain()?;

@@ -32,7 +32,7 @@ pub(crate) struct Foxglove {
 }
 
 impl Foxglove {
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         let mut output = Output::new();
         if let Some((name, _)) = self.target.host.as_deref().map(parts)
             && !is_near(name)

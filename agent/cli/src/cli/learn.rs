@@ -62,7 +62,7 @@ pub(crate) struct Learn {
 }
 
 impl Learn {
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         let selection = Selection::new(&self.topics)
             .map_err(|(typed, error)| UserError(format!("rp: the topic `{typed}` {error}")))?;
         let domain_id = self.target.domain()?;
@@ -165,7 +165,7 @@ impl Session {
     fn view_until_end(&mut self, lines: &mut Lines<'_>, agent: &Agent) -> Result<()> {
         let viewed = self.view(agent);
         match viewed {
-            Err(_) if ends_soon(lines) => Err(agent_ended().into()),
+            Err(_) if ends_within_a_second(lines) => Err(agent_ended().into()),
             viewed => viewed,
         }
     }
@@ -264,7 +264,7 @@ fn is_end(line: &[u8]) -> bool {
 }
 
 /// Returns whether the stream ends within a second.
-fn ends_soon(lines: &mut Lines<'_>) -> bool {
+fn ends_within_a_second(lines: &mut Lines<'_>) -> bool {
     let deadline = Instant::now() + Duration::from_secs(1);
     while let Some(left) = deadline.checked_duration_since(Instant::now()) {
         match lines.line_within(left) {

@@ -94,7 +94,7 @@ struct Printer<'a> {
 }
 
 impl Log {
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         let compile = |pattern| {
             let refused = format!("--grep: `{pattern}` is not a supported regular expression");
             expression(pattern).map_err(|_| UserError(refused))

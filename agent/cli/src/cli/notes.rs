@@ -42,7 +42,7 @@ pub(crate) struct Notes<'a> {
     /// Consequence of sampling for this verb.
     consequence: &'static str,
     sampling: Sampling,
-    heard: HashSet<String>,
+    received_topics: HashSet<String>,
     sampled: HashSet<String>,
     begun: Instant,
     is_explained: bool,
@@ -84,7 +84,7 @@ impl<'a> Notes<'a> {
                 true => Sampling::Nothing,
                 false => Sampling::at(agent),
             },
-            heard: HashSet::new(),
+            received_topics: HashSet::new(),
             sampled: HashSet::new(),
             begun: Instant::now(),
             is_explained: false,
@@ -117,8 +117,8 @@ impl<'a> Notes<'a> {
         if is_new && self.sampling.is_known(self.agent, self.begun) {
             self.print_sampled(&[topic.to_owned()]);
         }
-        if !self.heard.contains(topic) {
-            self.heard.insert(topic.to_owned());
+        if !self.received_topics.contains(topic) {
+            self.received_topics.insert(topic.to_owned());
         }
     }
 
@@ -156,14 +156,14 @@ impl<'a> Notes<'a> {
 
     fn print_explanation(&mut self) -> Result<()> {
         self.is_explained = true;
-        if self.are_parts && !self.heard.is_empty() {
+        if self.are_parts && !self.received_topics.is_empty() {
             return Ok(());
         }
-        if self.names.is_empty() && self.heard.is_empty() {
+        if self.names.is_empty() && self.received_topics.is_empty() {
             names_of(self.agent, self.domain_id)?;
         }
         for name in &self.names {
-            if self.heard.contains(name) {
+            if self.received_topics.contains(name) {
                 continue;
             }
             let path = path(name, self.domain_id);

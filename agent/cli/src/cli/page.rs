@@ -37,7 +37,7 @@ pub(crate) struct Page {
 }
 
 impl Page {
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         let mut output = Output::new();
         let near = match self.target.host.as_deref().map(parts) {
             Some((name, port)) if !is_near(name) => {

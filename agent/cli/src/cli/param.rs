@@ -56,7 +56,7 @@ struct Changes {
 }
 
 impl Param {
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         match self.command {
             Command::Dump(dump) => dump.ask(),
             Command::Changes(changes) => changes.ask(),

@@ -91,7 +91,7 @@ struct Options {
 }
 
 impl Hz {
-    pub(crate) fn ask(self, hidden: bool) -> Result<ExitCode> {
+    pub(crate) fn run(self, hidden: bool) -> Result<ExitCode> {
         let target = &self.options.target;
         let library = || library(target, self.definitions);
         let sieve = self
@@ -115,7 +115,7 @@ impl Hz {
 }
 
 impl Bandwidth {
-    pub(crate) fn ask(self, hidden: bool) -> Result<ExitCode> {
+    pub(crate) fn run(self, hidden: bool) -> Result<ExitCode> {
         measure(
             Quantity::Bandwidth,
             self.window,
@@ -133,7 +133,7 @@ impl Bandwidth {
 }
 
 impl Delay {
-    pub(crate) fn ask(self, hidden: bool) -> Result<ExitCode> {
+    pub(crate) fn run(self, hidden: bool) -> Result<ExitCode> {
         measure(
             Quantity::Delay,
             self.window,

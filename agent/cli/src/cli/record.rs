@@ -190,12 +190,12 @@ impl Record {
         self
     }
 
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         let phase = Phase::starting();
         let (give, commands) = channel();
         listen(give.clone(), phase.clone())?;
         let dialect = self.target.dialect();
-        let filter = Filter::new(self.asked(dialect)?).map_err(|error| refused(&error))?;
+        let filter = Filter::new(self.options_from(dialect)?).map_err(|error| refused(&error))?;
         let options = self.options()?;
         let domain_id = self.target.domain()?;
         let directory = self.directory()?;
@@ -306,7 +306,7 @@ impl Record {
         recorder
     }
 
-    fn asked(&self, dialect: Dialect) -> Result<FilterOptions> {
+    fn options_from(&self, dialect: Dialect) -> Result<FilterOptions> {
         let full = |names: &[String]| -> Result<Vec<String>> {
             let names = names.iter().map(|name| full_name(name));
             let names: Result<_, _> = names.collect();

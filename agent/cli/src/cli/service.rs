@@ -89,7 +89,7 @@ struct Info {
 }
 
 impl Service {
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         let hidden = self.include_hidden_services;
         match self.verb {
             None => super::help(&["service"]),
@@ -97,7 +97,7 @@ impl Service {
             Some(Verb::Type(kind)) => kind.ask(hidden),
             Some(Verb::Find(find)) => find.ask(hidden),
             Some(Verb::Info(info)) => info.ask(hidden),
-            Some(Verb::Echo(echo)) => echo.ask(),
+            Some(Verb::Echo(echo)) => echo.run(),
         }
     }
 }

@@ -118,7 +118,7 @@ fn rate(text: &str) -> Result<f64, UnsupportedRate> {
 }
 
 impl Tf {
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         let domain_id = self.target.domain()?;
         let path = format!("/transforms?domain_id={domain_id}");
         let agent = Agent::reach(&self.target)?;

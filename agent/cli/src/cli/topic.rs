@@ -113,7 +113,7 @@ impl Topic {
         }
     }
 
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         let hidden = self.include_hidden_topics;
         match self.verb {
             None => super::help(&["topic"]),
@@ -121,10 +121,10 @@ impl Topic {
             Some(Verb::Info(info)) => info.ask(),
             Some(Verb::Type(kind)) => kind.ask(hidden),
             Some(Verb::Find(find)) => find.ask(hidden),
-            Some(Verb::Echo(echo)) => echo.ask(),
-            Some(Verb::Hz(hz)) => hz.ask(hidden),
-            Some(Verb::Bw(bandwidth)) => bandwidth.ask(hidden),
-            Some(Verb::Delay(delay)) => delay.ask(hidden),
+            Some(Verb::Echo(echo)) => echo.run(),
+            Some(Verb::Hz(hz)) => hz.run(hidden),
+            Some(Verb::Bw(bandwidth)) => bandwidth.run(hidden),
+            Some(Verb::Delay(delay)) => delay.run(hidden),
         }
     }
 }

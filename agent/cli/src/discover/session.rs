@@ -85,9 +85,9 @@ pub struct Session {
     publications: Announcer,
     subscriptions: Announcer,
     /// Time of the first HEARTBEAT of either writer.
-    heard: Option<Timestamp>,
+    first_heartbeat: Option<Timestamp>,
     /// Time of the last request, and number of requests.
-    asked: Option<Timestamp>,
+    last_request: Option<Timestamp>,
     requests: u32,
     discovery_fragments: DiscoveryFragments,
     /// Incomplete samples, each with the time of its last fragment.
@@ -125,8 +125,8 @@ impl Session {
             announced: Timestamp(0),
             publications: Announcer::of(Role::Writer),
             subscriptions: Announcer::of(Role::Reader),
-            heard: None,
-            asked: None,
+            first_heartbeat: None,
+            last_request: None,
             requests: 0,
             discovery_fragments: DiscoveryFragments::default(),
             partial: Bounded::default(),
@@ -183,7 +183,7 @@ impl Session {
             self.began = now;
             self.introduce(now, &mut outgoing);
         }
-        let is_deaf = self.heard.is_none() && now - self.announced >= END_SILENCE;
+        let is_deaf = self.first_heartbeat.is_none() && now - self.announced >= END_SILENCE;
         if is_deaf && self.sent.packets == 1 {
             self.introduce(now, &mut outgoing);
         } else if is_deaf || now - self.began >= MAX_DURATION {
@@ -223,7 +223,7 @@ impl Session {
     /// Returns whether the participant sent a HEARTBEAT of a writer of SEDP.
     #[must_use]
     pub const fn was_answered(&self) -> bool {
-        self.heard.is_some()
+        self.first_heartbeat.is_some()
     }
 
     /// Returns the number of available announcements that did not arrive.
@@ -272,7 +272,7 @@ impl Session {
                 let range = heartbeat.first..=heartbeat.last;
                 if let Some(announcer) = announcer {
                     announcer.available = Some(range);
-                    self.heard.get_or_insert(now);
+                    self.first_heartbeat.get_or_insert(now);
                 } else if !entity.is_builtin() {
                     self.user_writers.insert(entity, range);
                 }
@@ -384,9 +384,9 @@ impl Session {
     /// Requests announcements after both writers have sent a HEARTBEAT. Repeats the request for
     /// further samples, or after a timeout.
     fn request_announcements(&mut self, now: Timestamp, outgoing: &mut Vec<Outgoing>) {
-        let Some(heard) = self.heard else { return };
+        let Some(heard) = self.first_heartbeat else { return };
         let both = self.publications.available.is_some() && self.subscriptions.available.is_some();
-        let due = match self.asked {
+        let due = match self.last_request {
             None => both || now - heard >= REQUEST_DELAY,
             Some(asked) => {
                 let came = self.publications.is_answered() && self.subscriptions.is_answered();
@@ -404,7 +404,7 @@ impl Session {
             let base = wanted.first().copied().unwrap_or_default();
             (base, wanted)
         }));
-        self.asked = Some(now);
+        self.last_request = Some(now);
         self.send(self.to_discovery("request", message), outgoing);
     }
 
@@ -475,10 +475,10 @@ impl Session {
 
     /// Returns whether all available answers have arrived.
     fn is_complete(&mut self, now: Timestamp) -> bool {
-        let Some(heard) = self.heard else {
+        let Some(heard) = self.first_heartbeat else {
             return false;
         };
-        let settled = match self.asked {
+        let settled = match self.last_request {
             Some(asked) => self.missing() == 0 || now - asked >= REQUEST_TIMEOUT,
             // A participant without endpoints sends HEARTBEATs with firstSN 1 and lastSN 0.
             None => now - heard >= REQUEST_DELAY && self.missing() == 0,
@@ -513,7 +513,7 @@ impl Session {
         wanted: [(SequenceNumber, N); 2],
     ) -> Message {
         let mut message = self.message();
-        if self.wants_nodes && self.asked.is_none() {
+        if self.wants_nodes && self.last_request.is_none() {
             message = message.read_nodes(self.local);
         }
         let both = [&self.publications, &self.subscriptions];

@@ -189,7 +189,7 @@ fn limits(health: &Health) -> Vec<Finding> {
             reached => format!("limits.{key} {now} ({cap}): {reached} refused or evicted so far"),
         };
         let known = config::Limit::find(key);
-        let blinds = *at_limit && known.is_some_and(config::Limit::blinds);
+        let blinds = *at_limit && known.is_some_and(config::Limit::hides_data);
         let (severity, sentence) = match blinds {
             true => (
                 Severity::Problem,

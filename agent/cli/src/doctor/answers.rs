@@ -45,7 +45,7 @@ impl Answers {
     /// # Errors
     ///
     /// Fails if the agent is unreachable or sends an unexpected answer.
-    pub fn ask(agent: &Agent, domain_id: Option<u32>) -> Result<Self, ClientError> {
+    pub fn request(agent: &Agent, domain_id: Option<u32>) -> Result<Self, ClientError> {
         let within = domain_id.map_or_else(String::new, |domain| format!("?domain_id={domain}"));
         Ok(Self {
             health: agent.get("/health")?,

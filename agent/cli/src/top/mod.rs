@@ -64,7 +64,7 @@ pub struct Options {
 ///
 /// Fails if the agent is unreachable or refuses.
 pub fn once(agent: &Agent, options: &Options) -> Result<String, ClientError> {
-    let (health, topics) = poller::ask(agent, options.domain_id, options.hidden)?;
+    let (health, topics) = poller::request(agent, options.domain_id, options.hidden)?;
     let (mut app, now) = (App::new(options, agent.place()), Instant::now());
     app.take(Fact::Health(Box::new(health)), now);
     app.take(Fact::Topics(Box::new(topics)), now);

@@ -105,7 +105,7 @@ impl Poller {
 /// # Errors
 ///
 /// Fails if the agent is unreachable or refuses.
-pub fn ask(
+pub fn request(
     agent: &Agent,
     domain_id: Option<u32>,
     hidden: bool,
@@ -139,7 +139,7 @@ impl Poll {
     }
 
     fn all(&mut self) {
-        match ask(&self.agent, self.domain_id, self.hidden) {
+        match request(&self.agent, self.domain_id, self.hidden) {
             Ok((health, topics)) => {
                 self.send(Fact::Health(Box::new(health)));
                 self.send(Fact::Topics(Box::new(topics)));

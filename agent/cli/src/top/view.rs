@@ -141,7 +141,7 @@ fn topics(app: &App, frame: &mut Frame<'_>, area: Rect, theme: Theme) {
     }
     let body = below(area);
     if rows.is_empty() {
-        put(frame, body, 0, nothing(app), theme, Kind::Plain);
+        put(frame, body, 0, empty_text(app), theme, Kind::Plain);
     }
     let visible = rows.iter().skip(app.offset).zip(0..body.height);
     for (row, at) in visible {
@@ -164,7 +164,7 @@ fn topics(app: &App, frame: &mut Frame<'_>, area: Rect, theme: Theme) {
 }
 
 /// Returns the reason for an empty table.
-fn nothing(app: &App) -> &'static str {
+fn empty_text(app: &App) -> &'static str {
     match (app.updated, app.rows().is_empty()) {
         (None, _) => "  waiting for the agent",
         (Some(_), true) => "  no topics yet",

@@ -75,7 +75,7 @@ fn a_host_with_systemd_runs_the_agent_until_the_package_is_purged() -> Result<()
     prints(&host, RUNS, "active")?;
     prints(&host, STARTS_AT_BOOT, "enabled")?;
     host.run("dpkg --purge ros2probe")?;
-    nothing_left(&host)
+    check_no_files(&host)
 }
 
 /// Fails unless the command prints this, whatever its exit code.
@@ -182,7 +182,7 @@ fn the_socket_admits_the_group_only(host: &Debian) -> Result<()> {
     host.run("useradd --groups ros2probe member; useradd stranger")?;
     let list = |user: &str| {
         let ids = format!("--reuid {user} --regid {user} --init-groups");
-        host.attempt(&format!("setpriv {ids} rp topic list"))
+        host.run_script(&format!("setpriv {ids} rp topic list"))
     };
     ensure!(
         list("member")?.status.success(),
@@ -227,7 +227,7 @@ fn a_wrong_configuration_fails_the_service_only(host: &Debian, upgrade: &str) ->
     host.run(&format!(
         "systemctl enable --now ros2probe; cp {CONFIG} /srv/; echo wach: [] >>{CONFIG}"
     ))?;
-    let output = host.attempt(upgrade)?;
+    let output = host.run_script(upgrade)?;
     ensure!(
         output.status.success() && all(&output).contains("wach: unknown key"),
         "{}",
@@ -275,11 +275,11 @@ fn a_host_without_systemd_accepts_the_package() -> Result<()> {
     host.run("dpkg --remove ros2probe")?;
     host.run(&format!("test -e {CONFIG} && test -d /var/lib/ros2probe"))?;
     host.run("dpkg --purge ros2probe")?;
-    nothing_left(&host)
+    check_no_files(&host)
 }
 
 /// Checks that a purge leaves only the user and dpkg's own records.
-fn nothing_left(host: &Debian) -> Result<()> {
+fn check_no_files(host: &Debian) -> Result<()> {
     let left = host.run(
         "find / -xdev \\( -path /proc -o -path /sys -o -path /packages -o -path /var/log \\) -prune \
          -o \\( -name '*ros2probe*' -o -path '/usr/share/man/*/rp*' \\) -print",

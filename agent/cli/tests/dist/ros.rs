@@ -311,7 +311,7 @@ fn commands_options_and_names_complete() -> Result<()> {
     ensure!(candidates(&["topic", "hz", "/nothing/of/it"])?.is_empty());
 
     // Names of topics come from the agent of this host.
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let _agent = Process::start_with(
         &network.inside(),
         RP,

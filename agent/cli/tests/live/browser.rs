@@ -468,7 +468,7 @@ fn a_chain_is_shown_as_a_waterfall_and_as_a_path_in_the_graph() -> Result<()> {
             return Ok(json!({}));
         }
         let agent = agent.as_ref().context("no agent")?;
-        let (status, answer) = local_agent::ask(agent.api, "GET", question, "");
+        let (status, answer) = local_agent::call_api(agent.api, "GET", question, "");
         ensure!(status == 200, "{question}: {status}");
         Ok(answer)
     };

@@ -173,7 +173,7 @@ fn healthy(seconds: u32) -> Result<String> {
 
 #[test]
 fn a_healthy_robot_passes_and_leaves_complete_artefacts() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let place = Place::new(&format!(
         "{}watch:\n  - {{topic: /imu, min_rate_hz: 20, max_silence_s: 2, publishers: 1}}\n",
         at_the_sockets_of(&host)
@@ -239,7 +239,7 @@ fn lost_messages_and_a_low_rate_fail_by_the_name_of_the_topic() -> Result<()> {
     )?;
     driver.wait_matched()?;
     let _loss = Loss::of_samples(&link.robot, &link.monitor, &stream, 100)?;
-    driver.go()?;
+    driver.start_sending()?;
     std::thread::sleep(Duration::from_secs(10));
     process.write_line("end")?;
     let cases = place.end(&mut process, CONDITION_FAILED)?;
@@ -259,7 +259,7 @@ fn lost_messages_and_a_low_rate_fail_by_the_name_of_the_topic() -> Result<()> {
 
 #[test]
 fn the_status_of_the_command_is_kept() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let place = Place::new(&at_the_sockets_of(&host))?;
     for (script, code) in [
         ("exit 7", 7),
@@ -308,7 +308,7 @@ fn hostile_names_are_escaped_in_every_artefact() -> Result<()> {
 
 #[test]
 fn signals_reach_the_command_and_the_artefacts_are_written() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let place = Place::new(&at_the_sockets_of(&host))?;
     for (signal, code) in [("INT", 42), ("TERM", 43)] {
         let script =
@@ -324,7 +324,7 @@ fn signals_reach_the_command_and_the_artefacts_are_written() -> Result<()> {
 
 #[test]
 fn children_end_with_an_rp_ci_that_is_killed() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let place = Place::new(&at_the_sockets_of(&host))?;
     let script = "sleep 3601 & sleep 3602 & echo began; wait";
     let mut process = place.start(&host, &[], script)?;
@@ -342,7 +342,7 @@ fn children_end_with_an_rp_ci_that_is_killed() -> Result<()> {
 
 #[test]
 fn several_runs_do_not_disturb_each_other_nor_an_installed_agent() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let installed = tempfile::tempdir()?;
     let file = installed.path().join("ros2probe.yaml");
     fs::write(&file, at_the_sockets_of(&host))?;
@@ -394,7 +394,7 @@ fn a_missing_capability_is_reported_before_the_command_runs() -> Result<()> {
 
 #[test]
 fn a_run_with_more_messages_than_the_bag_may_hold_keeps_a_complete_bag() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let place = Place::new(&format!(
         "{}recordings: {{max_bytes: 1048576}}\n",
         at_the_sockets_of(&host)
@@ -422,7 +422,7 @@ fn the_action_runs_rp_ci_with_its_inputs_and_keeps_the_status() -> Result<()> {
     let action: serde_yaml::Value = serde_yaml::from_str(&action)?;
     let step = &action["runs"]["steps"][0];
     let script = step["run"].as_str().context("no script")?;
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let place = Place::new(&at_the_sockets_of(&host))?;
     let input = |name: &str| match name {
         "run" => "source ./env.sh; exit $CODE".to_owned(),
@@ -479,7 +479,7 @@ fn agent_of(host: &Namespace) -> Result<String> {
 
 #[test]
 fn packets_that_the_agent_dropped_are_a_warning_and_fail_a_strict_run() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     // This ring holds some 500 records, and the robot causes one for each message.
     let place = Place::new("capture: {source: wire, record_ring_bytes: 65536}\n")?;
     let robot = healthy(12)?.replace("--rate 50", "--rate 500");
@@ -520,7 +520,7 @@ fn packets_that_the_agent_dropped_are_a_warning_and_fail_a_strict_run() -> Resul
 
 #[test]
 fn topics_beyond_a_limit_fail_a_strict_run() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let place = Place::new(&format!(
         "{}limits: {{topics: 1}}\n",
         at_the_sockets_of(&host)
@@ -545,7 +545,7 @@ fn topics_beyond_a_limit_fail_a_strict_run() -> Result<()> {
 
 #[test]
 fn an_agent_that_is_killed_fails_the_run_but_not_the_command() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let place = Place::new(&at_the_sockets_of(&host))?;
     let mut process = place.start(&host, &["--settle", "0"], "echo began; sleep 5; exit 0")?;
     process.wait_for("began", PATIENCE)?;

@@ -93,8 +93,8 @@ fn is_within_bounds(
     for peer in [&mut shifted, &mut listener, &mut back_to, &mut back_from] {
         peer.wait_matched()?;
     }
-    shifted.go()?;
-    back_from.go()?;
+    shifted.start_sending()?;
+    back_from.start_sending()?;
 
     // The bounds hold from the first one on, and become narrow.
     let deadline = SystemTime::now() + PATIENCE;

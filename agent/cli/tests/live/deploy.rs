@@ -24,7 +24,7 @@ const GAP: f64 = 6.0;
 /// The runtime's seccomp filter and its own setup of the confinement are not covered.
 #[test]
 fn an_agent_confined_by_the_daemon_set_sees_the_whole_node() -> Result<()> {
-    let node = Namespace::alone()?;
+    let node = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let file = |name: &str| -> PathBuf { directory.path().join(name) };
     let manifest = std::fs::read_to_string(deploy().join("kubernetes/ros2probe.yaml"))?;

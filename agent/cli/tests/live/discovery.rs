@@ -316,7 +316,7 @@ impl<'a> Robot<'a> {
             for (number, peer) in there {
                 // The Rust peer cannot end while it waits for the start.
                 if number % 2 == 0 {
-                    peer.go()?;
+                    peer.start_sending()?;
                 }
                 peer.process.signal("TERM")?;
                 ending.push(peer);
@@ -401,7 +401,7 @@ fn talking(link: &Link, stack: Stack, stream: &Stream) -> Result<(Peer, Peer)> {
     let mut publisher = Peer::start(&link.robot, stack, Role::Publisher, stream, &["/talker"])?;
     subscriber.wait_matched()?;
     publisher.wait_matched()?;
-    publisher.go()?;
+    publisher.start_sending()?;
     Ok((publisher, subscriber))
 }
 

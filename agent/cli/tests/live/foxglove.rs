@@ -14,7 +14,7 @@ use ros2probe_testing::harness::dissection::{Content, Dissection};
 use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream, pair};
 use ros2probe_testing::harness::usage::Usage;
-use ros2probe_testing::viewer::{News, PATIENCE, SUBPROTOCOLS, Viewer, open};
+use ros2probe_testing::viewer::{ServerMessage, PATIENCE, SUBPROTOCOLS, Viewer, open};
 use tempfile::TempDir;
 
 use crate::browser::player::watch;
@@ -101,7 +101,7 @@ fn payloads_are_as_sent(stack: Stack, size: usize) -> Result<()> {
         channel.schema
     );
     let pattern: Vec<u8> = (8..size).map(pattern).collect();
-    publisher.go()?;
+    publisher.start_sending()?;
     let mut received = BTreeMap::new();
     let mut reported = 0;
     let deadline = Instant::now() + 3 * PATIENCE;
@@ -112,7 +112,7 @@ fn payloads_are_as_sent(stack: Stack, size: usize) -> Result<()> {
             received.keys()
         );
         match viewer.next_within(PATIENCE)? {
-            Some(News::Data(data)) if data.subscription == id => {
+            Some(ServerMessage::Data(data)) if data.subscription == id => {
                 ensure!(
                     data.payload.len() == size,
                     "{} of {size}",
@@ -124,11 +124,11 @@ fn payloads_are_as_sent(stack: Stack, size: usize) -> Result<()> {
                     "{number} twice"
                 );
             }
-            Some(News::Status(status)) if status.message.contains("too slowly") => {
+            Some(ServerMessage::Status(status)) if status.message.contains("too slowly") => {
                 let count = status.message.split(' ').next().unwrap_or_default();
                 reported = count.parse()?;
             }
-            Some(News::Channels | News::Data(_)) => {}
+            Some(ServerMessage::Channels | ServerMessage::Data(_)) => {}
             news => bail!("{news:?} after {:?}", received.keys()),
         }
     }
@@ -162,7 +162,7 @@ fn payloads_are_as_sent(stack: Stack, size: usize) -> Result<()> {
     if stack == Stack::Cyclone {
         // The channel vanishes with the topic, once the lease of the killed nodes ends.
         drop((publisher, subscriber));
-        let is_gone = |viewer: &Viewer, _: &News| viewer.channel(TOPIC).is_none().then_some(());
+        let is_gone = |viewer: &Viewer, _: &ServerMessage| viewer.channel(TOPIC).is_none().then_some(());
         viewer.wait_for("end of the channel", is_gone)?;
     }
     Ok(())
@@ -185,7 +185,7 @@ fn the_public_client_decodes_every_channel_of_the_demo_robot() -> Result<()> {
 #[test]
 fn a_slow_or_killed_viewer_affects_no_other_viewer_and_no_capture() -> Result<()> {
     const MESSAGES: u64 = 120;
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let configuration = format!(
         "{}watch: []\nlimits: {{payload_bytes: 12582912}}\n",
         at_the_sockets_of(&host)
@@ -213,8 +213,8 @@ fn a_slow_or_killed_viewer_affects_no_other_viewer_and_no_capture() -> Result<()
                 let mut numbers = Vec::new();
                 while numbers.len() as u64 != MESSAGES {
                     match viewer.next_within(PATIENCE)? {
-                        Some(News::Data(data)) => numbers.push(number(&data.payload)?),
-                        Some(News::Channels) => {}
+                        Some(ServerMessage::Data(data)) => numbers.push(number(&data.payload)?),
+                        Some(ServerMessage::Channels) => {}
                         news => bail!("{news:?} after {numbers:?}"),
                     }
                 }
@@ -222,7 +222,7 @@ fn a_slow_or_killed_viewer_affects_no_other_viewer_and_no_capture() -> Result<()
             })
         })
         .collect();
-    publisher.go()?;
+    publisher.start_sending()?;
     std::thread::sleep(Duration::from_millis(500));
     // The kernel closes the sockets of a killed process in the same way: without a close frame, and
     // with unread data.
@@ -240,8 +240,8 @@ fn a_slow_or_killed_viewer_affects_no_other_viewer_and_no_capture() -> Result<()
     let mut reported = 0;
     while numbers.len() as u64 + reported != MESSAGES {
         match slow.next_within(PATIENCE)? {
-            Some(News::Data(data)) => ensure!(numbers.insert(number(&data.payload)?)),
-            Some(News::Status(status)) => {
+            Some(ServerMessage::Data(data)) => ensure!(numbers.insert(number(&data.payload)?)),
+            Some(ServerMessage::Status(status)) => {
                 ensure!(
                     status.level == 1 && status.message.ends_with("of /points"),
                     "{status:?}"
@@ -253,7 +253,7 @@ fn a_slow_or_killed_viewer_affects_no_other_viewer_and_no_capture() -> Result<()
                     .unwrap_or_default()
                     .parse()?;
             }
-            Some(News::Channels) => {}
+            Some(ServerMessage::Channels) => {}
             news => bail!("{news:?} after {} and {reported} reported", numbers.len()),
         }
     }
@@ -271,7 +271,7 @@ fn a_slow_or_killed_viewer_affects_no_other_viewer_and_no_capture() -> Result<()
     ensure!(
         page.sum("ros2_topic_messages_total", &label) == MESSAGES as f64,
         "{}",
-        page.doubts()
+        page.doubted_jumps()
     );
     ensure!(page.sum("ros2_topic_lost_messages_total", &label) == 0.0);
     let dropped = page.sum("ros2probe_foxglove_dropped_messages_total", &[]);
@@ -331,7 +331,7 @@ fn a_viewer_of_all_topics_causes_no_packet_of_the_robot() -> Result<()> {
         }
         let mut ports = publisher.process.udp_ports()?;
         ports.extend(subscriber.process.udp_ports()?);
-        publisher.go()?;
+        publisher.start_sending()?;
         // The viewer receives while the publisher sends, so that the recordings of both runs end
         // equally late.
         if let Some(viewer) = &mut viewer {
@@ -339,7 +339,7 @@ fn a_viewer_of_all_topics_causes_no_packet_of_the_robot() -> Result<()> {
             viewer.wait_for("messages", |viewer, news| {
                 let is_message = |id| viewer.channels[&viewer.subscriptions[&id]].topic == "/imu";
                 count +=
-                    u32::from(matches!(news, News::Data(data) if is_message(data.subscription)));
+                    u32::from(matches!(news, ServerMessage::Data(data) if is_message(data.subscription)));
                 (count > 100).then_some(())
             })?;
             ensure!(
@@ -425,7 +425,7 @@ fn the_cost_of_a_viewer_is_measured_beside_the_subscriber_of_a_bridge() -> Resul
         ..Stream::point_cloud(2_720_000, 20 * 150)
     };
     let (mut publisher, _subscriber) = pair(&link.robot, &link.monitor, Stack::Cyclone, &stream)?;
-    publisher.go()?;
+    publisher.start_sending()?;
     std::thread::sleep(Duration::from_secs(2));
     for round in 1..=ROUNDS {
         for watcher in ["nothing", "one viewer", "a subscriber in C++"] {
@@ -482,7 +482,7 @@ fn count(mut viewer: Viewer, span: Duration) -> Result<(u64, u64)> {
     let deadline = Instant::now() + span;
     let (mut messages, mut bytes) = (0, 0);
     while Instant::now() < deadline {
-        if let Some(News::Data(data)) = viewer.next_within(Duration::from_millis(200))? {
+        if let Some(ServerMessage::Data(data)) = viewer.next_within(Duration::from_millis(200))? {
             messages += 1;
             bytes += data.payload.len() as u64;
         }

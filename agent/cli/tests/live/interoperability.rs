@@ -109,7 +109,7 @@ impl Round {
             pair.subscriber.wait_matched()?;
         }
         for pair in &mut pairs {
-            pair.publisher.go()?;
+            pair.publisher.start_sending()?;
         }
         for pair in &mut pairs {
             pair.publisher.wait_sent()?;

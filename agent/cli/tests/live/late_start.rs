@@ -20,11 +20,11 @@ const PATIENCE: Duration = Duration::from_secs(60);
 /// Time until a restarted agent has all names. Endpoints are announced only once.
 const AT_ONCE: Duration = Duration::from_secs(5);
 /// Time for two announcements of each participant.
-const AFTERWARDS: Duration = Duration::from_secs(7);
+const TWO_ANNOUNCEMENTS_TIME: Duration = Duration::from_secs(7);
 /// Seconds in which each participant announces itself at least once.
 const LISTEN: &str = "5";
 /// Makes Cyclone DDS announce itself every 3 s, as Fast DDS does, instead of every 8 s.
-const TALKATIVE: &str = "CYCLONEDDS_URI=<Discovery><SPDPInterval>3s</SPDPInterval></Discovery>";
+const FREQUENT_SPDP: &str = "CYCLONEDDS_URI=<Discovery><SPDPInterval>3s</SPDPInterval></Discovery>";
 const NODES: [&str; 3] = ["/camera", "/listener", "/talker"];
 
 #[test]
@@ -166,7 +166,7 @@ fn asked(stack: Stack) -> Result<()> {
     let recording = Capture::start(&scene.link.monitor, &path)?;
     let log_before = robot.log()?;
     let printed = discovers_all_names(&scene, &agent)?;
-    std::thread::sleep(AFTERWARDS);
+    std::thread::sleep(TWO_ANNOUNCEMENTS_TIME);
     std::thread::sleep(SETTLE);
     packets_are_those_printed(&scene, &recording.finish()?, &printed)?;
     the_robot_is_undisturbed(&robot, &log_before)?;
@@ -319,7 +319,7 @@ impl Scene {
         fs::create_dir(directory.path().join("state"))?;
         Ok(Scene {
             link: Link::new()?,
-            place: Namespace::alone()?,
+            place: Namespace::isolated()?,
             directory,
         })
     }
@@ -355,7 +355,7 @@ impl Scene {
             ..Stream::small(100_000)
         };
         let mut host = self.link.robot.inside();
-        host.extend(["env", TALKATIVE].map(str::to_owned));
+        host.extend(["env", FREQUENT_SPDP].map(str::to_owned));
         let start = |role, nodes: &[&str]| Peer::launch_behind(&host, stack, role, &stream, nodes);
         let mut subscriber = start(Role::Subscriber, &["/listener"])?;
         subscriber.wait_ready()?;
@@ -363,7 +363,7 @@ impl Scene {
         publisher.wait_ready()?;
         subscriber.wait_matched()?;
         publisher.wait_matched()?;
-        publisher.go()?;
+        publisher.start_sending()?;
         Ok(Robot {
             publisher,
             subscriber,

@@ -74,7 +74,7 @@ impl<'a> Place<'a> {
 
 #[test]
 fn expectations_of_a_live_robot_are_learnt_without_a_watch_and_detect_its_faults() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let place = Place::new(&host, directory.path())?;
     let imu = Stream {
@@ -94,7 +94,7 @@ fn expectations_of_a_live_robot_are_learnt_without_a_watch_and_detect_its_faults
     let mut lidar = start(Role::Publisher, &scan, "/lidar")?;
     for publisher in [&mut driver, &mut lidar] {
         publisher.wait_matched()?;
-        publisher.go()?;
+        publisher.start_sending()?;
     }
 
     let begin = Instant::now();
@@ -142,7 +142,7 @@ fn expectations_of_a_live_robot_are_learnt_without_a_watch_and_detect_its_faults
     };
     let mut driver = start(Role::Publisher, &half, "/driver")?;
     driver.wait_matched()?;
-    driver.go()?;
+    driver.start_sending()?;
     slam.process.terminate()?;
     for (topic, expectation) in [("/imu", "min_rate_hz"), ("/scan", "subscribers")] {
         let what = format!("{topic} violates {expectation}");
@@ -181,7 +181,7 @@ fn is_complete(watchlist: &Path) -> Result<()> {
 
 #[test]
 fn rp_learn_writes_no_watchlist_if_the_agent_ends() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let mut place = Place::new(&host, directory.path())?;
     let learning = place.learn()?;

@@ -40,7 +40,7 @@ fn lines(host: &Namespace, path: &str, seconds: u32) -> Result<Vec<Value>> {
 
 #[test]
 fn the_stream_shows_a_running_robot() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let configuration = directory.path().join("ros2probe.yaml");
     let text = format!("{}watch: [/**]\n", at_the_sockets_of(&host));

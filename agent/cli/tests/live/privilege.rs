@@ -151,7 +151,7 @@ fn installed(host: &Namespace, file: &impl Fn(&str) -> PathBuf) -> Result<()> {
 
 #[test]
 fn an_agent_started_by_root_changes_its_user_and_writes_no_file_of_root() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let file = |name: &str| -> PathBuf { directory.path().join(name) };
     let socket = file("run").join("api.sock");
@@ -239,7 +239,7 @@ fn an_agent_that_cannot_drop_its_capabilities_serves_nothing() -> Result<()> {
 
 #[test]
 fn an_agent_resolves_the_name_of_a_collector_and_connects_to_it() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let network = host.network();
     let (names, collector) = netns::within(&network, || -> Result<_> {
         let names = UdpSocket::bind("127.0.0.1:53")?;
@@ -413,7 +413,7 @@ fn watch_a_stream(link: &Link, agent: &Agent<'_>) -> Result<Scrape> {
     )?;
     subscriber.wait_matched()?;
     publisher.wait_matched()?;
-    publisher.go()?;
+    publisher.start_sending()?;
     publisher.wait_sent(Duration::from_secs(30))?;
     let page = agent.settled_scrape("/imu", SAMPLES)?;
     let received = page.sum(

@@ -57,7 +57,7 @@ fn prometheus_returns_the_rates_at_which_the_demo_robot_publishes() -> Result<()
     subscriber.wait_matched()?;
     publisher.wait_matched()?;
     ensure!(prometheus.query("up")? > 0.5, "the scrape works");
-    publisher.go()?;
+    publisher.start_sending()?;
     let publisher_log = publisher.log_path();
     let sent = || -> Result<Vec<u64>> {
         let log = EventLog::read(&publisher_log)?;

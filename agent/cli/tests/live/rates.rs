@@ -29,7 +29,7 @@ static TURN: Mutex<()> = Mutex::new(());
 #[test]
 fn ten_clients_print_correct_rates_on_a_busy_machine_and_leave_no_trace() -> Result<()> {
     let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let (agent, socket) = agent(&host, directory.path())?;
     let stream = Stream::small(100_000);
@@ -56,7 +56,7 @@ fn ten_clients_print_correct_rates_on_a_busy_machine_and_leave_no_trace() -> Res
     let bandwidth = start("bw /imu")?;
     let delay = start("delay /imu")?;
     open(&agent, 10)?;
-    publisher.go()?;
+    publisher.start_sending()?;
 
     killed.prints("=====")?;
     killed.child.kill()?;
@@ -88,7 +88,7 @@ fn ten_clients_print_correct_rates_on_a_busy_machine_and_leave_no_trace() -> Res
     for client in [hz, all, bandwidth, delay] {
         drop(client);
     }
-    let_go(&agent, "/imu", 1000.0)?;
+    check_unsubscribed(&agent, "/imu", 1000.0)?;
     ensure!(publisher.log()?.sequences("pub").len() as f64 > sent as f64 + RATE);
     Ok(())
 }
@@ -142,7 +142,7 @@ fn echoing_point_clouds_takes_bounded_memory_and_changes_no_count() -> Result<()
     const AGENT: u64 = 160 << 20;
     const CLIENT: u64 = 64 << 20;
     let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let (agent, socket) = agent(&host, directory.path())?;
     let stream = Stream {
@@ -157,7 +157,7 @@ fn echoing_point_clouds_takes_bounded_memory_and_changes_no_count() -> Result<()
     })?;
     let hz = Client::start(&socket, "hz /points")?;
     let mut echo = Client::start(&socket, "echo /points")?;
-    publisher.go()?;
+    publisher.start_sending()?;
     let shown = || -> usize {
         let printed = echo.printed();
         printed
@@ -204,12 +204,12 @@ fn echoing_point_clouds_takes_bounded_memory_and_changes_no_count() -> Result<()
         "{said} of {true_rate}"
     );
     drop(hz);
-    let_go(&agent, "/points", 50.0)
+    check_unsubscribed(&agent, "/points", 50.0)
 }
 
 /// Checks that the topic continues and its count stays: a subscription that a client left behind
 /// would increase it.
-fn let_go(agent: &Agent<'_>, topic: &str, least: f64) -> Result<()> {
+fn check_unsubscribed(agent: &Agent<'_>, topic: &str, least: f64) -> Result<()> {
     wait_until("the topic is let go", || {
         let counted = || -> Result<f64> {
             let labels = [("topic", topic)];

@@ -40,7 +40,7 @@ static MACHINE: RwLock<()> = RwLock::new(());
 #[test]
 fn every_message_is_in_the_bags_or_counted_as_missing() -> Result<()> {
     let _alone = MACHINE.write().unwrap_or_else(PoisonError::into_inner);
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let robot = Robot::start(&host, "watch: ['/**']\n", &host.on_network())?;
     let streams = [
         (Stack::Cyclone, "/front", CLOUD, CLOUDS),
@@ -59,7 +59,7 @@ fn every_message_is_in_the_bags_or_counted_as_missing() -> Result<()> {
     ensure!(status == 201, "{status}");
     let mut client = Recorder::start(&robot, "client", &["-a"])?;
     for (_, _, publisher, _) in &mut pairs {
-        publisher.go()?;
+        publisher.start_sending()?;
     }
     let page = settled(&robot, &pairs, 1)?;
     let (status, ended) = robot.ask("DELETE", "/recordings/all", &Value::Null)?;
@@ -85,7 +85,7 @@ fn every_message_is_in_the_bags_or_counted_as_missing() -> Result<()> {
             ensure!(
                 (messages, lost) == (*count as f64, 0.0),
                 "{topic}: {messages} counted, {lost} lost: {}",
-                page.doubts()
+                page.doubted_jumps()
             );
         }
     }
@@ -145,7 +145,7 @@ fn all_or_counted(bag: &Path, report: &Value, pairs: &[Pair], page: &Scrape) -> 
         ensure!(recorded.is_subset(&sent), "{topic}");
         if is_exact(page) {
             let all = recorded.len() as u64 + missing;
-            ensure!(all == *count, "{topic}: {report:#}\n{}", page.doubts());
+            ensure!(all == *count, "{topic}: {report:#}\n{}", page.doubted_jumps());
         }
         ensure!(recorded.len() as u64 * 2 > *count, "{topic}: {report:#}");
     }
@@ -164,7 +164,7 @@ fn a_slow_reader_loses_the_largest(robot: &Robot<'_>, pairs: &mut [Pair]) -> Res
     let mut slow = Recorder::start(robot, "slow", &arguments)?;
     slow.process.signal("STOP")?;
     for (_, _, publisher, _) in pairs.iter_mut() {
-        publisher.go()?;
+        publisher.start_sending()?;
     }
     let page = settled(robot, pairs, 2)?;
     let memory = Usage::of(robot.agent.process.pid())?.memory.unreclaimable;
@@ -196,7 +196,7 @@ fn a_slow_reader_loses_the_largest(robot: &Robot<'_>, pairs: &mut [Pair]) -> Res
         ensure!(recorded.is_subset(&sent), "{topic}");
         if is_exact(&page) {
             let all = recorded.len() as u64 + missing;
-            ensure!(all == *count, "{topic}: {report:#}\n{}", page.doubts());
+            ensure!(all == *count, "{topic}: {report:#}\n{}", page.doubted_jumps());
         }
         // The largest messages are dropped first, so small messages stay complete.
         let is_large = *topic == "/front";
@@ -215,12 +215,12 @@ fn a_slow_reader_loses_the_largest(robot: &Robot<'_>, pairs: &mut [Pair]) -> Res
 #[test]
 fn a_recording_is_controlled_by_its_client_and_outlives_it() -> Result<()> {
     let _shared = MACHINE.read().unwrap_or_else(PoisonError::into_inner);
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let settings = "watch: [{topic: /imu, max_silence_s: 4}]\n\
                     recordings: {snapshots: [{name: incident, topics: [/imu], seconds: 10}]}\n";
     let mut robot = Robot::start(&host, settings, &host.on_network())?;
     let (mut imu, _subscriber) = robot.pair(&Stream::small(1_000_000))?;
-    imu.go()?;
+    imu.start_sending()?;
 
     names_that_lead_elsewhere_are_refused(&robot)?;
     a_client_pauses_resumes_splits_and_ends_a_recording(&robot)?;
@@ -355,7 +355,7 @@ fn numbers_of_imu(bag: &Path) -> Result<BTreeSet<u64>> {
 #[test]
 fn a_full_storage_ends_a_recording_in_order() -> Result<()> {
     let _shared = MACHINE.read().unwrap_or_else(PoisonError::into_inner);
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     // Only the agent has this disk of 4 MB.
     let mut enter = host.on_network();
     let script = r#"mount -t tmpfs -o size=4m none "$0" && exec "$@""#;
@@ -363,7 +363,7 @@ fn a_full_storage_ends_a_recording_in_order() -> Result<()> {
     let robot = Robot::start_on_disk(&host, "watch: []\n", enter)?;
     let stream = Stream::point_cloud(SCAN, 1_000_000);
     let (mut lidar, _subscriber) = robot.pair(&stream)?;
-    lidar.go()?;
+    lidar.start_sending()?;
 
     let (status, begun) = robot.ask("POST", "/recordings", &json!({"name": "full"}))?;
     ensure!(status == 201, "{begun}");

@@ -34,7 +34,7 @@ const OF_ALL: [&str; 2] = ["/rosout", "/parameter_events"];
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
 fn a_router_lists_the_graph_that_ros2_prints_and_no_node_appears() -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
     let refused = rp(&host, &[])?;
     let said = String::from_utf8_lossy(&refused.stderr).into_owned();
@@ -88,7 +88,7 @@ fn a_router_lists_the_graph_that_ros2_prints_and_no_node_appears() -> Result<()>
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
 fn routers_of_other_configurations_answer_or_are_refused_by_name() -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
     let users = host.path("users.txt");
     fs::write(&users, "user:password")?;

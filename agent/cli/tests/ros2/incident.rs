@@ -37,7 +37,7 @@ fn echo(host: &Host<'_>, name: &str, reliability: &str) -> Result<Process> {
 #[test]
 #[ignore = "needs ROS 2 with rmw_fastrtps_cpp, ros2bag, rosbag2_storage_mcap: make test-ros2"]
 fn a_finding_causes_a_bag_of_the_seconds_around_it_that_ros2_plays() -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let host = Host::new(&network, Middleware::Cyclone)?;
     let bags = host.file("bags");
     let agent = host.agent(&format!(

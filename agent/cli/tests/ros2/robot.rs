@@ -76,7 +76,7 @@ fn zenoh_is_recorded_to_the_message() -> Result<()> {
 }
 
 fn holds_what_was_published(middleware: Middleware) -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let robot = Robot {
         host: Host::new(&network, middleware)?,
     };
@@ -213,7 +213,7 @@ fn bag_holds_or_names_each_message(
             "{topic}: {} recorded, {missing} missing and {unseen} unknown of {count}, not named: {:?}: {report:#}\n{}",
             in_bag.len(),
             unnamed(&in_bag, &report, topic, count),
-            page.doubts()
+            page.doubted_jumps()
         );
         let least = match is_looked_at {
             true if LARGE.contains(&topic) => 0.0,
@@ -223,16 +223,16 @@ fn bag_holds_or_names_each_message(
         ensure!(
             in_bag.len() as f64 >= least,
             "{topic}: {report:#}\n{}",
-            page.doubts()
+            page.doubted_jumps()
         );
         let counted = page.sum("ros2_topic_messages_total", &[("topic", topic)]);
         ensure!(
             counted == (count - unseen) as f64,
             "{topic}: {counted} counted of {count}: {}",
-            page.doubts()
+            page.doubted_jumps()
         );
         let lost = page.sum("ros2_topic_lost_messages_total", &[("topic", topic)]);
-        ensure!(lost == 0.0, "{topic}: {lost} lost: {}", page.doubts());
+        ensure!(lost == 0.0, "{topic}: {lost} lost: {}", page.doubted_jumps());
     }
     Ok(unknown_of)
 }

@@ -91,7 +91,7 @@ fn with_zenoh_ros2_prints_the_same_and_opens_no_session() -> Result<()> {
 }
 
 fn answers_as_the_real_daemon(middleware: Middleware) -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let robot = Robot {
         host: Host::new(&network, middleware)?,
     };

@@ -111,7 +111,7 @@ impl Recording {
 }
 
 /// Checks the rules of every conversation.
-fn assert_is_polite(session: &Session, recording: &Recording, outgoing: &[(u64, Outgoing)]) {
+fn assert_conversation_rules(session: &Session, recording: &Recording, outgoing: &[(u64, Outgoing)]) {
     let (sent, _) = session.cost();
     assert!(sent.packets <= MAX_PACKETS, "{} packets", sent.packets);
     assert_eq!(sent.packets as usize, outgoing.len());
@@ -149,7 +149,7 @@ fn real_participants_get_the_recorded_packets_and_announce_all_endpoints() {
         let sent: Vec<_> = outgoing.iter().map(|(_, packet)| &packet.bytes).collect();
         let recorded: Vec<_> = recording.sent.iter().map(|(_, bytes)| bytes).collect();
         assert_eq!(sent, recorded);
-        assert_is_polite(&session, &recording, &outgoing);
+        assert_conversation_rules(&session, &recording, &outgoing);
         let expected = (0..24).map(|n| format!("/robot/sensors/camera_{n}"));
         assert_eq!(names(&session), expected.collect());
         let writers = session
@@ -170,7 +170,7 @@ fn without_nodes_one_packet_less_is_sent_and_no_reader_is_announced() {
     for recording in Recording::both() {
         let mut session = Session::new(recording.speaker, recording.target, false);
         let outgoing = recording.play(&mut session, &recording.received);
-        assert_is_polite(&session, &recording, &outgoing);
+        assert_conversation_rules(&session, &recording, &outgoing);
         assert_eq!((outgoing.len(), session.endpoints().len()), (3, 26));
         assert!(session.nodes().is_none() && !session.expects_nodes());
         let reader = |(_, packet): &(u64, Outgoing)| {
@@ -188,7 +188,7 @@ fn silence_leads_to_one_more_introduction_and_a_goodbye() {
     let [recording, _] = Recording::both();
     let mut session = recording.session();
     let outgoing = recording.play(&mut session, &[]);
-    assert_is_polite(&session, &recording, &outgoing);
+    assert_conversation_rules(&session, &recording, &outgoing);
     let said: Vec<_> = outgoing.iter().map(|(_, packet)| packet.what).collect();
     assert_eq!(said, ["introduction", "introduction", "goodbye"]);
     let (last, _) = outgoing.last().unwrap();
@@ -219,7 +219,7 @@ fn a_participant_with_endless_announcements_gets_no_more_packets() {
             .collect();
         let mut session = recording.session();
         let outgoing = recording.play(&mut session, &answers);
-        assert_is_polite(&session, &recording, &outgoing);
+        assert_conversation_rules(&session, &recording, &outgoing);
         assert!(session.missing() > 0 && session.missing() <= 2 * 4096);
     }
 }
@@ -361,6 +361,6 @@ proptest! {
         }
         let mut session = recording.session();
         let outgoing = recording.play(&mut session, &answers);
-        assert_is_polite(&session, recording, &outgoing);
+        assert_conversation_rules(&session, recording, &outgoing);
     }
 }

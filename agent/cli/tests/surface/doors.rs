@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 
 use crate::rp;
 use ros2probe_testing::local_agent::{
-    Answer, LocalAgent, PATIENCE, ask, exchange, promtool, request,
+    Answer, LocalAgent, PATIENCE, call_api, exchange, promtool, request,
 };
 use seccompiler::{BpfProgram, SeccompAction, SeccompFilter};
 use serde_json::Value;
@@ -43,7 +43,7 @@ fn bytes_of(address: SocketAddr, path: &str, headers: &str) -> (String, Vec<u8>)
 fn unfinished_requests_with_long_heads_take_little_memory_and_block_no_client() {
     let mut agent = LocalAgent::start(&mut rp(), &["--speed", "max"]);
     agent.wait_for_log("ready");
-    assert_eq!(ask(agent.api, "GET", "/health", "").0, 200);
+    assert_eq!(call_api(agent.api, "GET", "/health", "").0, 200);
     let before = kibibytes(&agent, "RssAnon");
     let mut most = 0;
     let mut clients = Vec::new();
@@ -72,7 +72,7 @@ fn unfinished_requests_with_long_heads_take_little_memory_and_block_no_client() 
         .saturating_sub(before);
     eprintln!("160 unfinished requests of up to 380 KB: {grown} KiB");
     assert!(grown < 3 << 10, "{grown} KiB");
-    assert_eq!(ask(agent.api, "GET", "/health", "").0, 200);
+    assert_eq!(call_api(agent.api, "GET", "/health", "").0, 200);
     assert_eq!(agent.get("/metrics").status, 200);
     drop(clients);
 }
@@ -197,7 +197,7 @@ fn missing_system_call_filters_are_reported_everywhere() {
         .find(|line| line.starts_with("ros2probe_sandbox_info{"));
     let shown = shown.unwrap_or_default();
     assert!(shown.contains("system_calls=\"all\""), "{shown}");
-    let health = ask(agent.api, "GET", "/health", "").1;
+    let health = call_api(agent.api, "GET", "/health", "").1;
     assert!(health["unfiltered_reason"].is_string(), "{health}");
 }
 

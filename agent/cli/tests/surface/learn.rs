@@ -19,7 +19,7 @@ const ALICE: GuidPrefix = GuidPrefix(*b"\x01\x10learn.alic");
 const BOB: GuidPrefix = GuidPrefix(*b"\x01\x10learn.bobb");
 const START: u64 = 1_800_000_000 * SECOND;
 const SECOND: u64 = 1_000_000_000;
-const LASTS: u64 = 60;
+const CAPTURE_SECONDS: u64 = 60;
 
 /// Topics and their periods in milliseconds.
 const TOPICS: [(&str, u64); 6] = [
@@ -90,7 +90,7 @@ fn topic(
         Box::new(move |capture| capture.reader(at, 0, to, name, announcement)),
     ));
     let mut sequence_number = 0;
-    for count in 0..LASTS * 1000 / period {
+    for count in 0..CAPTURE_SECONDS * 1000 / period {
         let since = SECOND / 2 + count * period * 1_000_000;
         let is_sent = match fault {
             Some(Fault::HalfRate) => count % 2 == 0,

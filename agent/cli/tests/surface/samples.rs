@@ -309,7 +309,7 @@ impl Robot {
     }
 
     /// Returns writer, number and payload of each sample, or the reason for a missed sample.
-    fn given(&mut self) -> Vec<(GuidPrefix, u64, Result<Vec<u8>, MissedReason>)> {
+    fn payloads_of(&mut self) -> Vec<(GuidPrefix, u64, Result<Vec<u8>, MissedReason>)> {
         let given = self.observer.drain().samples.into_iter();
         given
             .map(|given| match given.outcome {
@@ -340,7 +340,7 @@ fn fragments_are_assembled_and_samples_are_delivered_in_the_order_of_completion(
         robot.fragment(ALICE, 1, start, &large);
         robot.fragment(BOB, 1, start.min(2), &small);
     }
-    assert_eq!(robot.given(), [(BOB, 1, Ok(small.clone()))]);
+    assert_eq!(robot.payloads_of(), [(BOB, 1, Ok(small.clone()))]);
     for start in [5, 1, 4] {
         robot.fragment(ALICE, 1, start, &large);
     }
@@ -350,7 +350,7 @@ fn fragments_are_assembled_and_samples_are_delivered_in_the_order_of_completion(
     let guid = Guid::new(BOB, WRITER);
     robot.put(Message::from(BOB).dispose_by_key(WRITER, 3, 0x70, guid));
     let expected = [(ALICE, 1, Ok(large)), (BOB, 2, Ok(small[..400].to_vec()))];
-    assert_eq!(robot.given(), expected);
+    assert_eq!(robot.payloads_of(), expected);
 }
 
 #[test]
@@ -365,7 +365,7 @@ fn a_sample_that_stays_incomplete_is_reported_and_not_delivered() {
     robot
         .observer
         .input(Input::Time(Timestamp(robot.at + 30 * SECOND)));
-    let given: Vec<_> = robot.given();
+    let given: Vec<_> = robot.payloads_of();
     let expected = [
         (ALICE, 1, Ok(payload(20))),
         (ALICE, 3, Ok(payload(24))),
@@ -422,15 +422,15 @@ fn sample_requests_measure_unwatched_topics_until_the_last_request_ends() {
     robot.subscribe(&["/points"], Depth::Arrivals);
     assert_eq!(verdict(&mut robot), Some(Verdict::Meter));
     robot.put(Message::from(ALICE).data(WRITER, 2, &payload(20)));
-    assert_eq!(robot.given(), [(ALICE, 2, Ok(Vec::new()))]);
+    assert_eq!(robot.payloads_of(), [(ALICE, 2, Ok(Vec::new()))]);
     robot.subscribe(&["/points"], Depth::Payloads);
     assert_eq!(verdict(&mut robot), Some(Verdict::Capture));
     robot.put(Message::from(ALICE).data(WRITER, 3, &payload(20)));
-    assert_eq!(robot.given(), [(ALICE, 3, Ok(payload(20)))]);
+    assert_eq!(robot.payloads_of(), [(ALICE, 3, Ok(payload(20)))]);
     robot.observer.input(Input::SampleRequests(Arc::default()));
     assert_eq!(verdict(&mut robot), Some(Verdict::Ignore));
     robot.put(Message::from(ALICE).data(WRITER, 4, &payload(20)));
-    assert!(robot.given().is_empty());
+    assert!(robot.payloads_of().is_empty());
     let snapshot = robot.observer.snapshot(Timestamp(robot.at));
     assert!(snapshot.watches.is_empty());
     let points = snapshot.topics.iter().find(|topic| topic.name == "/points");
@@ -458,7 +458,7 @@ fn samples_beyond_the_cap_in_bytes_are_reported_and_memory_is_bounded() {
         robot.put(Message::from(ALICE).data(WRITER, number, &payload(10_000)));
         assert!(held(&robot) <= 100_000);
     }
-    let given = robot.given();
+    let given = robot.payloads_of();
     let (whole, missed): (Vec<_>, Vec<_>) = given.iter().partition(|given| given.2.is_ok());
     assert_eq!(given.len(), 20);
     assert!(
@@ -481,7 +481,7 @@ fn samples_beyond_the_cap_in_bytes_are_reported_and_memory_is_bounded() {
     for start in 1..=30 {
         robot.fragment(ALICE, 60, start, &large);
     }
-    assert!(robot.given().contains(&(ALICE, 60, Ok(large))));
+    assert!(robot.payloads_of().contains(&(ALICE, 60, Ok(large))));
 }
 
 #[test]

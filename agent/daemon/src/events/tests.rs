@@ -243,7 +243,7 @@ async fn a_waiting_reader_is_woken_by_the_next_event() {
 }
 
 /// Waits briefly for a future.
-trait Soon: Future + Sized {
+trait AwaitSoon: Future + Sized {
     async fn await_soon(self, expected: bool) {
         let timeout = Duration::from_millis(if expected { 10_000 } else { 20 });
         let came = tokio::time::timeout(timeout, self).await.is_ok();
@@ -251,4 +251,4 @@ trait Soon: Future + Sized {
     }
 }
 
-impl<F: Future> Soon for F {}
+impl<F: Future> AwaitSoon for F {}

@@ -20,7 +20,7 @@ use super::Role;
 pub enum FilterError {
     /// The filter cannot be built.
     #[error(transparent)]
-    Made(#[from] BackendError),
+    Build(#[from] BackendError),
     /// The kernel does not support filters, or not for this process.
     #[error("{0}")]
     Refused(String),

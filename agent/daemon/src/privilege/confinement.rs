@@ -183,7 +183,7 @@ impl Role {
 /// Fails if the kernel refuses to drop capabilities, which is not expected, or if the filter cannot
 /// be built.
 pub fn confine(role: Role) -> Result<(), ConfineError> {
-    give_up(role)?;
+    drop_capabilities(role)?;
     rustix::thread::set_no_new_privs(true).map_err(|error| ConfineError::Gain(error.into()))?;
     let sandbox = match calls::load(role) {
         Ok(()) => Sandbox::Filtered,
@@ -199,7 +199,7 @@ pub fn confine(role: Role) -> Result<(), ConfineError> {
 /// # Errors
 ///
 /// Fails if the kernel refuses, which is not expected for capabilities that the thread has.
-pub fn give_up(role: Role) -> Result<(), DropError> {
+pub fn drop_capabilities(role: Role) -> Result<(), DropError> {
     capabilities::keep(role.capabilities())
 }
 

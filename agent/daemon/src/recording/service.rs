@@ -110,7 +110,7 @@ pub struct Recording {
     /// Domain of the topics.
     pub domain_id: u32,
     /// Selection of topics.
-    pub asked: FilterOptions,
+    pub requested: FilterOptions,
     /// Time of its start.
     pub began: SystemTime,
     begin: Begin,
@@ -246,7 +246,7 @@ impl Recordings {
             name,
             directory,
             domain_id: wanted.domain_id,
-            asked: wanted.requested,
+            requested: wanted.requested,
             began: SystemTime::now(),
             begin: subscription.begin(),
             status: Mutex::default(),

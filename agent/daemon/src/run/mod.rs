@@ -186,7 +186,7 @@ impl Run {
             let subscribed = self.subscriptions.is_open();
             let slice = if !self.observer.has_applied_lists() {
                 Duration::ZERO
-            } else if self.outputs.latest.is_asked() {
+            } else if self.outputs.latest.is_requested() {
                 REQUESTED_PUBLISH_INTERVAL
             } else if subscribed {
                 SUBSCRIBED_SLICE
@@ -217,7 +217,7 @@ impl Run {
             let has_arrived = self.end_jump(pace, has_event);
             let age = published.elapsed();
             let is_current = age < REQUESTED_PUBLISH_INTERVAL && !self.source.is_paused();
-            let is_asked = !is_current && self.outputs.latest.is_asked();
+            let is_asked = !is_current && self.outputs.latest.is_requested();
             let held = self.source.reached_pause();
             let must = finished || held || has_arrived || polled.is_err() || is_asked;
             if must || age >= PUBLISH_INTERVAL {
@@ -329,11 +329,11 @@ impl Run {
         if let Source::Live(live) = &mut self.source {
             live.apply(&output.interest);
             let now = Instant::now();
-            live.want_inside(self.outputs.latest.are_calls_requested(now));
+            live.request_inside(self.outputs.latest.are_calls_requested(now));
             let mut demand = self.outputs.latest.late_demand(now);
             self.causes.note(&output.events.events, now);
             self.causes.add_to(&mut demand, now);
-            live.want_late(&demand);
+            live.request_late_calls(&demand);
         }
         let mut events = output.events.events.iter();
         let has_event = events.any(|event| {
@@ -450,7 +450,7 @@ impl Run {
         if let Some(history) = &self.history {
             snapshot.tables.push(history.table());
             // A reader that waits for this state may read the last seconds next.
-            if self.outputs.latest.is_asked() {
+            if self.outputs.latest.is_requested() {
                 self.outputs.latest.publish_past(history.past());
             }
         }

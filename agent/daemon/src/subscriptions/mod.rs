@@ -127,7 +127,7 @@ pub struct Subscriptions {
     stop: CancellationToken,
     /// Bytes in all queues; each sample counts once.
     queued: Arc<AtomicUsize>,
-    given: AtomicU64,
+    enqueued: AtomicU64,
     missed: [AtomicU64; MissedReason::ALL.len()],
     refused: AtomicU64,
     crowded_out: AtomicU64,
@@ -161,7 +161,7 @@ impl Subscriptions {
             caps,
             stop,
             queued: Arc::default(),
-            given: AtomicU64::new(0),
+            enqueued: AtomicU64::new(0),
             missed: Default::default(),
             refused: AtomicU64::new(0),
             crowded_out: AtomicU64::new(0),
@@ -216,7 +216,7 @@ impl Subscriptions {
         SubscriptionFacts {
             open: self.channels.load().len(),
             refused: self.refused.load(Ordering::Relaxed),
-            enqueued: self.given.load(Ordering::Relaxed),
+            enqueued: self.enqueued.load(Ordering::Relaxed),
             missed: missed.map(|count| count.load(Ordering::Relaxed)),
             crowded_out: self.crowded_out.load(Ordering::Relaxed),
             queued_bytes: self.queued.load(Ordering::Relaxed),
@@ -270,7 +270,7 @@ impl Subscriptions {
                     ..request.clone()
                 };
                 for sample in latched(&fresh) {
-                    self.given.fetch_add(1, Ordering::Relaxed);
+                    self.enqueued.fetch_add(1, Ordering::Relaxed);
                     channel.sample(&sample, None, &self.stop);
                 }
                 channel.wake();
@@ -329,7 +329,7 @@ impl Subscriptions {
         let mut arrival = None;
         let mut charge = None;
         for channel in recipients(channels, to) {
-            self.given.fetch_add(1, Ordering::Relaxed);
+            self.enqueued.fetch_add(1, Ordering::Relaxed);
             let wants_payload = channel.depth() == Depth::Payloads;
             let sample = match &sample.payload {
                 Some(_) if !wants_payload => arrival.get_or_insert_with(|| {

@@ -139,7 +139,7 @@ impl CompressedText {
     pub(super) fn into_body(self, reservation: Option<Reservation>) -> Body {
         let encoding = self.encoding;
         let pieces = self.pieces.into_iter().map(move |piece| {
-            if reservation.as_ref().is_some_and(Reservation::is_given_up) {
+            if reservation.as_ref().is_some_and(Reservation::is_revoked) {
                 return Err(io::Error::other("read too slowly while others waited"));
             }
             match encoding {

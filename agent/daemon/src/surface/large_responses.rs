@@ -34,7 +34,7 @@ pub(super) struct LargeResponses {
 struct Pending {
     bytes: usize,
     /// Revokes the answer: its reader receives no further data.
-    given_up: CancellationToken,
+    revoked: CancellationToken,
 }
 
 /// Permission to create one answer.
@@ -79,14 +79,14 @@ impl LargeResponses {
         kept.retain(|each| {
             let stays = sum + bytes <= MAX_RETAINED_BYTES;
             if !stays {
-                each.given_up.cancel();
+                each.revoked.cancel();
                 sum -= each.bytes;
             }
             stays
         });
         kept.push(Pending {
             bytes,
-            given_up: given_up.clone(),
+            revoked: given_up.clone(),
         });
         Reservation { of: self, given_up }
     }
@@ -123,7 +123,7 @@ impl RenderPermit {
 
 impl Reservation {
     /// Returns whether the memory is revoked.
-    pub(super) fn is_given_up(&self) -> bool {
+    pub(super) fn is_revoked(&self) -> bool {
         self.given_up.is_cancelled()
     }
 }
@@ -131,7 +131,7 @@ impl Reservation {
 impl Drop for Reservation {
     fn drop(&mut self) {
         self.given_up.cancel();
-        self.of.lock().retain(|each| !each.given_up.is_cancelled());
+        self.of.lock().retain(|each| !each.revoked.is_cancelled());
     }
 }
 

@@ -357,7 +357,7 @@ impl WriterTrace {
                     Progress::Complete(facts) => (facts.began, facts.source),
                     Progress::Rejected | Progress::TooMany => {
                         self.in_transit.remove(index);
-                        shared.give_up();
+                        shared.drop_oldest();
                         return;
                     }
                 }
@@ -378,7 +378,7 @@ impl WriterTrace {
             self.arrived
                 .pop_front()
                 .map_or_else(|| drop(self.waiting.pop_front()), drop);
-            shared.give_up();
+            shared.drop_oldest();
         }
         let mut span = Span {
             stage: SpanStage::Receive,
@@ -431,14 +431,14 @@ impl WriterTrace {
         if self.in_transit.is_full() {
             self.in_transit.pop_front();
             self.in_transit.refuse();
-            shared.give_up();
+            shared.drop_oldest();
         }
         if shared.open.is_full() {
             if self.waiting.pop_front().is_none() {
                 shared.open.refuse();
                 return None;
             }
-            shared.give_up();
+            shared.drop_oldest();
         }
         shared.open.add(1);
         self.in_transit.push_back(message);
@@ -492,7 +492,7 @@ impl Place {
     fn of(head: &Head, is_local: bool) -> Option<Self> {
         let is_stream = matches!(head.path, Path::Stream { .. });
         let by_router = is_stream && head.is_at_socket() && !is_local;
-        match (head.leaves(), is_local) {
+        match (head.is_outgoing(), is_local) {
             (true, _) if by_router => None,
             (true, _) => Some(Self::Departure),
             (false, true) => Some(Self::LocalCopy),
@@ -506,7 +506,7 @@ impl Shared {
         self.lost += u64::from(self.finished.push(span).is_some());
     }
 
-    fn give_up(&mut self) {
+    fn drop_oldest(&mut self) {
         self.open.sub(1);
         self.open.refuse();
     }

@@ -289,7 +289,7 @@ impl Events {
     }
 
     /// Adds samples that reached no receiver to the burst of their writer.
-    pub fn lose(&mut self, loss: &Loss) {
+    pub fn add_loss(&mut self, loss: &Loss) {
         let count = loss.last.steps_since(loss.first).saturating_add(1);
         if let Some(burst) = self.burst(loss.writer, loss.at, (loss.first, loss.last)) {
             burst.losses.count = burst.losses.count.saturating_add(count);
@@ -383,7 +383,7 @@ impl Events {
 
 /// Returns the text, truncated to the maximum length in an event.
 #[must_use]
-pub fn bounded(text: &str) -> &str {
+pub fn truncated(text: &str) -> &str {
     text.get(..text.floor_char_boundary(MAX_TEXT))
         .unwrap_or_default()
 }
@@ -398,8 +398,8 @@ pub fn bounded_finding(finding: &Diagnosis) -> Diagnosis {
         Diagnosis::DuplicateNode { participants, .. } => participants.truncate(MAX_LIST),
         Diagnosis::NodeInSeveralDomains { domains, .. } => domains.truncate(MAX_LIST),
         Diagnosis::SharedMachineId { participants, .. } => participants.truncate(MAX_LIST),
-        Diagnosis::LogErrors { text, .. } => *text = bounded(text).into(),
-        Diagnosis::ClocksApart { peer, .. } => *peer = bounded(peer).into(),
+        Diagnosis::LogErrors { text, .. } => *text = truncated(text).into(),
+        Diagnosis::ClocksApart { peer, .. } => *peer = truncated(peer).into(),
         Diagnosis::QosIncompatible { .. }
         | Diagnosis::UnmatchedPublisher { .. }
         | Diagnosis::UnmatchedSubscription { .. }
@@ -458,9 +458,9 @@ mod tests {
     #[test]
     fn losses_of_one_writer_become_one_event_when_the_burst_ends() {
         let mut events = Events::default();
-        events.lose(&loss(guid(1), 10, 5, 7));
-        events.lose(&loss(guid(2), 11, 1, 1));
-        events.lose(&loss(guid(1), 12, 9, 9));
+        events.add_loss(&loss(guid(1), 10, 5, 7));
+        events.add_loss(&loss(guid(2), 11, 1, 1));
+        events.add_loss(&loss(guid(1), 12, 9, 9));
         assert!(events.take(WallClock::default()).events.is_empty());
         events.name(guid(2), DomainId(3), &"rt/points".into());
         events.end_bursts(|burst| {
@@ -502,7 +502,7 @@ mod tests {
         for number in 0..MAX_EVENTS_PER_SECOND + 7 {
             events.push(ModelTime::from_nanoseconds(number.into()), node("/a"));
         }
-        events.lose(&loss(guid(1), 10, 5, 7));
+        events.add_loss(&loss(guid(1), 10, 5, 7));
         events.end_bursts(|_| {});
         let taken = events.take(WallClock::default());
         assert_eq!(taken.events.len(), usize::from(MAX_EVENTS_PER_SECOND) + 1);
@@ -562,7 +562,7 @@ mod tests {
     #[test]
     fn long_texts_are_truncated_between_characters() {
         let long: TopicName = "\u{e9}".repeat(5_000).into();
-        assert_eq!(bounded(&long).len(), MAX_TEXT);
+        assert_eq!(truncated(&long).len(), MAX_TEXT);
         assert_eq!(long.bounded(MAX_TEXT).len(), MAX_TEXT);
         let short: TopicName = "/points".into();
         assert!(std::sync::Arc::ptr_eq(

@@ -97,9 +97,9 @@ impl Journal {
 
     /// Adds a loss, extending the last entry if the loss continues it. The loss becomes an event
     /// unless its receivers report it.
-    pub fn lose(&mut self, loss: Loss, has_receivers: bool) {
+    pub fn add_loss(&mut self, loss: Loss, has_receivers: bool) {
         if !has_receivers {
-            self.events.lose(&loss);
+            self.events.add_loss(&loss);
         }
         if let Some(last) = self.losses.back_mut()
             && last.writer == loss.writer

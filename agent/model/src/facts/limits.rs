@@ -264,7 +264,7 @@ impl Limit {
 
     /// Returns whether reaching the limit hides a part of the robot.
     #[must_use]
-    pub const fn blinds(self) -> bool {
+    pub const fn hides_data(self) -> bool {
         matches!(
             self,
             Self::Participants

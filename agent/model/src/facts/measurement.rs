@@ -209,7 +209,7 @@ impl Delivered {
     }
 
     /// Adds losses by this cause.
-    pub const fn lose(&mut self, cause: LossCause, count: u64) {
+    pub const fn add_lost(&mut self, cause: LossCause, count: u64) {
         match cause {
             LossCause::Sender => self.lost_at_sender += count,
             LossCause::BeforeHost => self.lost_before_host += count,

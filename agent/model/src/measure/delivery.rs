@@ -398,7 +398,7 @@ impl Delivery {
         let settled = other.reception.sequence().settled();
         let (reception, budget, mut accounting) = self.split(context);
         for (first, last) in long {
-            accounting.lose(LossCause::BeforeHost, first, last);
+            accounting.add_loss(LossCause::BeforeHost, first, last);
         }
         for number in pending {
             accounting.wait(number, number);

@@ -82,7 +82,7 @@ pub struct TopicEvaluation {
     fresh: bool,
     state: WatchState,
     violated: bool,
-    broken: u8,
+    violated_bits: u8,
     bad: u8,
     good: u8,
     /// Evaluations until an interval counts again after a silence.
@@ -124,7 +124,7 @@ impl Default for TopicEvaluation {
             fresh: true,
             state: WatchState::Ok,
             violated: false,
-            broken: 0,
+            violated_bits: 0,
             bad: 0,
             good: 0,
             ending: 0,
@@ -142,7 +142,7 @@ impl TopicEvaluation {
     /// Returns the keys of the violated expectations.
     #[must_use]
     pub fn violations(&self) -> Vec<&'static str> {
-        let broken = |bit: &usize| self.broken & 1 << bit != 0;
+        let broken = |bit: &usize| self.violated_bits & 1 << bit != 0;
         (0..EXPECTATION_NAMES.len())
             .filter(broken)
             .filter_map(|bit| EXPECTATION_NAMES.get(bit).copied())
@@ -200,12 +200,12 @@ impl TopicEvaluation {
             WatchState::Ok
         };
         match self.state {
-            WatchState::Silent => self.broken = broken,
+            WatchState::Silent => self.violated_bits = broken,
             // In a violated state without a currently violated expectation, the last ones stay
             // listed.
-            WatchState::Violated if broken != 0 => self.broken = broken,
+            WatchState::Violated if broken != 0 => self.violated_bits = broken,
             WatchState::Violated => {}
-            _ => self.broken = 0,
+            _ => self.violated_bits = 0,
         }
         self.fresh = false;
         (before.unwrap_or(WatchState::Ok) != self.state).then_some(before)

@@ -104,13 +104,13 @@ impl Payloads {
 
     /// Returns whether payloads of any writer are requested.
     #[must_use]
-    pub const fn wants_any_bytes(&self) -> bool {
+    pub const fn needs_any_payload(&self) -> bool {
         self.deep > 0
     }
 
     /// Returns whether payloads of this writer are requested.
     #[must_use]
-    pub fn wants_bytes(&self, writer: Guid) -> bool {
+    pub fn needs_payload(&self, writer: Guid) -> bool {
         let is_deep = |interested: &WantedWriter| !interested.payloads.is_empty();
         self.deep > 0 && self.writers.get(&writer).is_some_and(is_deep)
     }
@@ -177,7 +177,7 @@ impl Payloads {
     /// Dispatches the waiting samples of this writer, and then stops dispatching its samples.
     pub fn release(&mut self, writer: Guid, now: ModelTime) {
         self.unknown_writers.remove(&writer);
-        self.give_all(writer, now);
+        self.dispatch_all(writer, now);
         let before = self.writers.remove(&writer);
         if before.is_some_and(|before| !before.payloads.is_empty()) {
             self.deep -= 1;
@@ -302,7 +302,7 @@ impl Payloads {
         progress: &Progress,
     ) -> Option<SequenceNumber> {
         let is_whole = self.assembly.is_whole(writer, counted.number);
-        if self.wants_bytes(writer) && !is_whole {
+        if self.needs_payload(writer) && !is_whole {
             return None;
         }
         self.counted(writer, counted, progress)
@@ -311,7 +311,7 @@ impl Payloads {
     /// Returns whether this sample was counted before its writer's announcement and is dispatched
     /// if it is retransmitted.
     #[must_use]
-    pub fn lacks(&self, writer: Guid, number: SequenceNumber) -> bool {
+    pub fn is_undispatched(&self, writer: Guid, number: SequenceNumber) -> bool {
         let interested = self.writers.get(&writer);
         interested.is_some_and(|interested| interested.order.is_undispatched(number))
     }
@@ -400,7 +400,7 @@ impl Payloads {
 
     /// Dispatches all waiting samples of a writer that has ended, and reports the samples that were
     /// not retransmitted.
-    pub fn give_all(&mut self, writer: Guid, now: ModelTime) {
+    pub fn dispatch_all(&mut self, writer: Guid, now: ModelTime) {
         let nothing_awaited = Progress::default();
         let Some(interested) = self.writers.get_mut(&writer) else {
             return;
@@ -431,7 +431,7 @@ impl Payloads {
             self.assembly.forget(writer, first);
         }
         for missed in interested.missed(writer, (first, last), (reason, now), self.payload_delay) {
-            self.give(missed, 0);
+            self.push_dispatch(missed, 0);
         }
     }
 
@@ -471,7 +471,7 @@ impl Payloads {
                     missed.samples = missed.samples.min(samples);
                 }
             }
-            missed.into_iter().for_each(|missed| self.give(missed, 0));
+            missed.into_iter().for_each(|missed| self.push_dispatch(missed, 0));
         }
     }
 
@@ -486,7 +486,7 @@ impl Payloads {
             .filter_map(|run| Some((*run.first()?, *run.last()?)))
             .flat_map(|run| interested.missed(writer, run, reason, delay))
             .collect();
-        missed.into_iter().for_each(|missed| self.give(missed, 0));
+        missed.into_iter().for_each(|missed| self.push_dispatch(missed, 0));
     }
 
     fn enqueue(&mut self, queued: QueuedSample) {
@@ -497,14 +497,14 @@ impl Payloads {
                 to: queued.to,
                 outcome: SampleOutcome::Sample(queued.sample),
             };
-            self.give(sample, bytes);
+            self.push_dispatch(sample, bytes);
         }
         if let Some(missed) = queued.missed {
-            self.give(missed, 0);
+            self.push_dispatch(missed, 0);
         }
     }
 
-    fn give(&mut self, dispatches: QueuedDispatch, bytes: usize) {
+    fn push_dispatch(&mut self, dispatches: QueuedDispatch, bytes: usize) {
         let (used, limit, _) = self.size();
         if self.dispatches.len() < WaitingDispatches::CAP / 2
             && (bytes == 0 || used + bytes <= limit)

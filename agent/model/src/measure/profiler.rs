@@ -47,7 +47,7 @@ const KERNEL_UPDATE_TIME: Duration = Duration::from_millis(200);
 const UNKNOWN_WRITERS_SHARE: usize = 4;
 /// Deliveries that are dropped for new ones: minimum silence, and maximum number per tick.
 const DELIVERY_TIMEOUT: Duration = Duration::from_secs(10);
-const GIVEN_UP: usize = 64;
+const MAX_DROPPED_DELIVERIES: usize = 64;
 
 /// A measured writer.
 #[derive(Debug)]
@@ -261,7 +261,7 @@ impl Profiler {
                 .measurement_context(writer_ref, now, journal, graph.wall_clock),
         );
         if novelty == Novelty::Duplicate && head.path != Path::Wire {
-            measured.writer.came_again();
+            measured.writer.note_retransmission();
         }
         if let Some(subscribers) = &mut measured.subscribers
             && measured.writer.next() > next
@@ -443,7 +443,7 @@ impl Profiler {
             self.stop(*guid, now, journal, graph);
         }
         if std::mem::take(&mut self.shared.quota.wanted) {
-            self.give_up_silent(now, journal, graph);
+            self.drop_silent(now, journal, graph);
         }
         unknown_writers
     }
@@ -474,7 +474,7 @@ impl Profiler {
     }
 
     /// Drops the deliveries that have been silent longest, because a new one was refused.
-    fn give_up_silent(&mut self, now: ModelTime, journal: &mut Journal, graph: &Graph) {
+    fn drop_silent(&mut self, now: ModelTime, journal: &mut Journal, graph: &Graph) {
         let mut silent: Vec<_> = self
             .writers
             .iter()
@@ -483,14 +483,14 @@ impl Profiler {
             .filter(|(at, _)| *at + DELIVERY_TIMEOUT <= now)
             .collect();
         silent.sort_unstable();
-        for (at, guid) in silent.into_iter().take(GIVEN_UP) {
+        for (at, guid) in silent.into_iter().take(MAX_DROPPED_DELIVERIES) {
             let Some(measured) = self.writers.get_mut(&guid) else {
                 continue;
             };
             let writer_ref = measured.writer_ref(guid);
             if let Some(subscribers) = &mut measured.subscribers {
                 let mut context = self.shared.writer_context(writer_ref, now, journal, graph);
-                subscribers.give_up(at, 1, &mut context);
+                subscribers.drop_oldest(at, 1, &mut context);
             }
         }
     }

@@ -17,7 +17,7 @@ use crate::measure::sequence::{Arrival, MAX_TRUSTED_JUMP, RepairMode, RunMembers
 /// retransmission.
 const MIN_REPAIR_DELAY: i64 = 5_000_000;
 /// Number of samples before the newest one for whose fragments a sampled view still waits.
-const UNDER_WAY: u64 = 8;
+const PENDING_SAMPLES: u64 = 8;
 
 /// State of one writer's samples at one point.
 #[derive(Debug, Default)]
@@ -107,7 +107,7 @@ impl Reception {
         budget: &mut Budget,
     ) -> bool {
         if !unconfirmed {
-            let oldest = sample.sequence_number.saturating_sub(UNDER_WAY);
+            let oldest = sample.sequence_number.saturating_sub(PENDING_SAMPLES);
             self.samples.forget_below(oldest, budget);
         }
         let progress = self.samples.fragment(sample, fragments, budget);

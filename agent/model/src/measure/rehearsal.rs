@@ -131,7 +131,7 @@ fn duration(seconds: f32) -> Duration {
 mod tests {
     use super::*;
 
-    fn steady(messages: u32) -> Second {
+    fn steady_seconds(messages: u32) -> Second {
         Second {
             messages,
             silence: Some(0.1),
@@ -153,7 +153,7 @@ mod tests {
 
     #[test]
     fn one_slow_second_violates_nothing_and_two_in_a_row_violate_the_rate() {
-        let mut seconds = vec![steady(10); 60];
+        let mut seconds = vec![steady_seconds(10); 60];
         seconds[0].messages = 1;
         seconds[30].messages = 3;
         assert!(violations(&expecting(), &seconds).is_empty());
@@ -166,7 +166,7 @@ mod tests {
         // 40 Hz on a busy robot, in pairs of slow seconds.
         let busy = |part: u32| -> Vec<Second> {
             let counts = [24, 26, 46, 44, 46, 46, 40, 48].into_iter().cycle();
-            counts.take(80).map(|count| steady(count / part)).collect()
+            counts.take(80).map(|count| steady_seconds(count / part)).collect()
         };
         let expecting = |window_s| Expectations {
             min_rate_hz: Some(30.0),
@@ -180,7 +180,7 @@ mod tests {
 
     #[test]
     fn silence_and_a_missing_subscriber_are_reported_by_their_keys() {
-        let mut silent = vec![steady(10); 60];
+        let mut silent = vec![steady_seconds(10); 60];
         for (place, second) in silent.iter_mut().enumerate().skip(40) {
             second.messages = 0;
             second.silence = Some((place - 39) as f32);

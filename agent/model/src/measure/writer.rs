@@ -195,7 +195,7 @@ impl Writer {
     }
 
     /// Counts a sample or fragment that arrived again on the same route.
-    pub const fn came_again(&mut self) {
+    pub const fn note_retransmission(&mut self) {
         self.tally.duplicates += 1;
     }
 
@@ -204,7 +204,7 @@ impl Writer {
     pub fn has(&self, sample: &Sample) -> bool {
         let (at, number) = (sample.head.at, sample.sequence_number);
         let sequence = self.reception.sequence();
-        if self.is_under_way(sample) {
+        if self.is_pending(sample) {
             return false;
         }
         if sample.head.is_polled() && self.is_exact(at) {
@@ -250,7 +250,7 @@ impl Writer {
     /// Returns how long the writer may seem silent while it sends, because polling misses messages.
     /// `slowest` is the assumed interval of its messages if it is not known.
     #[must_use]
-    pub fn seeming_silence(&self, slowest: Duration) -> Duration {
+    pub fn max_unseen_time(&self, slowest: Duration) -> Duration {
         let sampled = self.sampled.as_ref();
         sampled.map_or(Duration::ZERO, |sampled| sampled.max_unseen_time(slowest))
     }
@@ -295,7 +295,7 @@ impl Writer {
             self.exact = self.exact.max(Some(at));
         }
         if let Observation::Sample(sample) = observation
-            && self.is_under_way(sample)
+            && self.is_pending(sample)
         {
             return self.catch_up(sample, context);
         }
@@ -603,7 +603,7 @@ impl Settling<'_> {
             first,
             last,
         };
-        self.journal.lose(loss, self.has_receivers);
+        self.journal.add_loss(loss, self.has_receivers);
     }
 }
 

@@ -68,7 +68,7 @@ use crate::measure::topic::{Accelerated, TopicId, Topics, Watched};
 use crate::observe::input::{Captured, Input, NewLog, Output};
 use crate::observe::interest::Interest;
 use crate::report::snapshot::Snapshot;
-use crate::report::transport::{lacks_names, may_share_memory};
+use crate::report::transport::{has_missing_names, may_share_memory};
 use lists::{traced_share, traits};
 use references::{CountedAs, References};
 pub use settings::Settings;
@@ -327,8 +327,8 @@ impl Observer {
 
     /// Returns whether a subscription requests payloads.
     #[must_use]
-    pub const fn wants_payloads(&self) -> bool {
-        self.measure.payloads.wants_any_bytes()
+    pub const fn needs_payloads(&self) -> bool {
+        self.measure.payloads.needs_any_payload()
     }
 
     /// Returns whether so much output waits that it should be drained before further input.
@@ -352,7 +352,7 @@ impl Observer {
             .any(|(guid, _)| may_share(guid))
         {
             Wanted::Samples
-        } else if lacks_names(&self.graph.discovery, self.clock) {
+        } else if has_missing_names(&self.graph.discovery, self.clock) {
             Wanted::Names
         } else {
             Wanted::Nothing
@@ -511,7 +511,7 @@ impl Observer {
                 // A router's socket sends samples of many sessions.
                 Path::Stream { .. } => self.graph.receivers.is_local(&sender),
                 Path::Wire | Path::SharedMemory { .. }
-                    if self.settings.directed && head.leaves() =>
+                    if self.settings.directed && head.is_outgoing() =>
                 {
                     self.graph.receivers.note_local(sender)
                 }
@@ -576,7 +576,7 @@ impl Observer {
                 }
                 if self.measure.payloads.is_unsettled(writer) {
                     if let Some(sample) = sample {
-                        self.came_again(sample);
+                        self.note_retransmitted(sample);
                     }
                     self.turn(writer, observation.head().at);
                 }
@@ -682,7 +682,7 @@ impl Observer {
                         self.find_references(topic);
                     }
                 }
-                Change::Gone(guid, endpoint) => self.gone(guid, &endpoint, now),
+                Change::Gone(guid, endpoint) => self.remove_discovered(guid, &endpoint, now),
             }
         }
     }
@@ -726,7 +726,7 @@ impl Observer {
         }
     }
 
-    fn gone(&mut self, guid: Guid, endpoint: &Endpoint, now: ModelTime) {
+    fn remove_discovered(&mut self, guid: Guid, endpoint: &Endpoint, now: ModelTime) {
         self.requested.interest.remove(guid);
         self.derive.services.forget(guid);
         self.derive.tracer.forget(guid);

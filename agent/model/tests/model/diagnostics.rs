@@ -52,7 +52,7 @@ impl Robot {
     }
 
     /// Sends this level once a second.
-    fn go_on(&mut self, level: u8, seconds: u64) {
+    fn publish_for(&mut self, level: u8, seconds: u64) {
         for second in 0..seconds {
             self.say(level, &format!("message {second}"));
             self.domain.wait(1000);
@@ -138,30 +138,30 @@ fn a_change_of_level_is_one_event_and_the_first_ok_is_no_event() {
 #[test]
 fn an_error_of_five_seconds_is_a_finding_until_it_ends() {
     let mut robot = Robot::new();
-    robot.go_on(2, 4);
+    robot.publish_for(2, 4);
     assert_eq!(robot.findings(), []);
-    robot.go_on(2, 5);
+    robot.publish_for(2, 5);
     // The message is that of the report, so that the finding does not change each second.
     let reported = robot.findings();
     assert_eq!(reported.len(), 1);
-    robot.go_on(2, 5);
+    robot.publish_for(2, 5);
     assert_eq!(robot.findings(), reported);
-    robot.go_on(0, 2);
+    robot.publish_for(0, 2);
     assert_eq!(robot.findings(), []);
 }
 
 #[test]
 fn a_start_up_in_error_and_a_warning_are_no_findings() {
     let mut robot = Robot::new();
-    robot.go_on(2, 4);
-    robot.go_on(1, 60);
+    robot.publish_for(2, 4);
+    robot.publish_for(1, 60);
     assert_eq!(robot.findings(), []);
 }
 
 #[test]
 fn a_silent_diagnostic_part_becomes_stale_and_then_a_finding() {
     let mut robot = Robot::new();
-    robot.go_on(0, 10);
+    robot.publish_for(0, 10);
     (0..4).for_each(|_| robot.domain.wait(1000));
     assert_eq!(robot.only().level, Ok);
     (0..3).for_each(|_| robot.domain.wait(1000));
@@ -191,7 +191,7 @@ fn a_part_that_publishes_every_forty_seconds_is_never_stale() {
 #[test]
 fn the_diagnostics_of_a_removed_node_are_removed() {
     let mut robot = Robot::new();
-    robot.go_on(2, 8);
+    robot.publish_for(2, 8);
     assert_eq!(robot.findings().len(), 1);
     robot
         .domain
@@ -204,7 +204,7 @@ fn the_diagnostics_of_a_removed_node_are_removed() {
 #[test]
 fn what_an_aggregator_repeats_is_kept_and_is_no_finding_of_its_own() {
     let mut robot = Robot::with(Settings::default(), "rt/diagnostics_agg");
-    robot.go_on(2, 20);
+    robot.publish_for(2, 20);
     assert_eq!(robot.only().level, Error);
     assert_eq!((robot.findings(), robot.changes()), (vec![], vec![]));
 }

@@ -23,7 +23,7 @@ use ros2probe_wire::record::{flag, guid_words, kind};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Record, Timestamp};
 
 /// Locked while memory is measured, because tests may run concurrently in one process.
-static ALONE: Mutex<()> = Mutex::new(());
+static MEASUREMENT_LOCK: Mutex<()> = Mutex::new(());
 
 /// Returns the resident memory of this process in bytes.
 fn resident() -> usize {
@@ -140,7 +140,7 @@ fn send_from_all(observer: &mut Observer, writers: &[Guid], mut now: u64) -> u64
 /// written.
 #[test]
 fn entries_take_at_most_the_documented_memory() {
-    let _alone = ALONE.lock().unwrap();
+    let _alone = MEASUREMENT_LOCK.lock().unwrap();
     let limits = Limits::default();
     let before = resident();
     let mut observer = Observer::new(Settings::default().with_limits(&limits));
@@ -212,7 +212,7 @@ fn entries_take_at_most_the_documented_memory() {
 #[test]
 fn a_recording_takes_at_most_the_documented_memory() {
     const BAGS: usize = 4;
-    let _alone = ALONE.lock().unwrap();
+    let _alone = MEASUREMENT_LOCK.lock().unwrap();
     let place = tempfile::tempdir().unwrap();
     let large: Vec<u8> = (0..3_000_000_u32).map(|at| (at / 7) as u8).collect();
     let before = resident();

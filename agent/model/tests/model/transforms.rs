@@ -71,7 +71,7 @@ impl Robot {
     }
 
     /// Broadcasts odom -> base_link of this guid at 10 Hz.
-    fn go_on(&mut self, guid: Guid, seconds: u64) {
+    fn broadcast_for(&mut self, guid: Guid, seconds: u64) {
         for _ in 0..seconds * 10 {
             self.broadcast(guid, "odom", "base_link", 1.0);
             self.wait(100);
@@ -117,7 +117,7 @@ fn names<const N: usize>(names: [&str; N]) -> Vec<String> {
 #[test]
 fn an_edge_has_its_last_transform_its_rate_and_its_broadcaster() {
     let mut robot = Robot::new();
-    robot.go_on(FIRST, 12);
+    robot.broadcast_for(FIRST, 12);
     robot.broadcast(FIRST, "/odom", "/base_link", 7.0);
     let edge = robot.edge("base_link");
     assert_eq!(
@@ -154,13 +154,13 @@ fn static_and_moving_transforms_of_each_namespace_are_separate() {
 #[test]
 fn a_silent_broadcaster_is_a_fault_and_a_removed_broadcaster_is_not() {
     let mut robot = Robot::new();
-    robot.go_on(FIRST, 5);
+    robot.broadcast_for(FIRST, 5);
     (0..5).for_each(|_| robot.wait(1000));
     assert_eq!(
         robot.faults(),
         [(Silent, "base_link".to_owned(), names(["/ekf"]))]
     );
-    robot.go_on(FIRST, 2);
+    robot.broadcast_for(FIRST, 2);
     assert_eq!(robot.faults(), []);
     (0..5).for_each(|_| robot.wait(1000));
     let gone = Message::from(FIRST.prefix).dispose_by_hash(SEDP_WRITERS, 2, FIRST);
@@ -182,8 +182,8 @@ fn an_edge_at_one_fortieth_hertz_is_not_silent_between_two_transforms() {
 #[test]
 fn two_simultaneous_broadcasters_are_a_fault_and_a_successor_is_not() {
     let mut robot = Robot::new();
-    robot.go_on(FIRST, 8);
-    robot.go_on(SECOND, 8);
+    robot.broadcast_for(FIRST, 8);
+    robot.broadcast_for(SECOND, 8);
     assert!(
         robot
             .faults()
@@ -290,15 +290,15 @@ fn three_jumps_within_a_minute_are_a_fault_until_a_minute_after_the_first_one() 
 fn a_stamp_that_goes_back_is_an_event_and_a_fault_for_a_minute() {
     let mut robot = Robot::new();
     robot.now = 100_000;
-    robot.go_on(FIRST, 3);
+    robot.broadcast_for(FIRST, 3);
     robot.now -= 50_000;
-    robot.go_on(FIRST, 2);
+    robot.broadcast_for(FIRST, 2);
     assert_eq!(robot.jumps(), [TransformJump::Time]);
     assert_eq!(
         robot.faults(),
         [(TimeWentBack, "base_link".to_owned(), names(["/ekf"]))]
     );
-    robot.go_on(FIRST, 60);
+    robot.broadcast_for(FIRST, 60);
     assert_eq!(robot.faults(), []);
 }
 
@@ -318,7 +318,7 @@ fn transforms_are_not_read_if_they_are_switched_off() {
         ..Settings::default()
     };
     let mut robot = Robot::with(settings, ["rt/tf"; 2]);
-    robot.go_on(FIRST, 1);
+    robot.broadcast_for(FIRST, 1);
     let facts = robot.domain.snapshot().transforms;
     assert!(!facts.are_read && facts.trees.is_empty());
 }

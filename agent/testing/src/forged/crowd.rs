@@ -72,8 +72,8 @@ pub struct Crowd<C> {
     /// Number of messages on each measured topic.
     messages: Vec<u32>,
     /// Disposals of participants and endpoints since [`Crowd::forget`].
-    farewells: Vec<Vec<u8>>,
-    born: u32,
+    disposals: Vec<Vec<u8>>,
+    participants_created: u32,
     due: Instant,
     ticked: Instant,
     owed: [f64; 3],
@@ -92,8 +92,8 @@ impl<C: Carrier> Crowd<C> {
             silent: Vec::new(),
             tally: Tally::new(),
             messages: vec![0; STAYING * MEASURED],
-            farewells: Vec::new(),
-            born: 0,
+            disposals: Vec::new(),
+            participants_created: 0,
             due: now,
             ticked: now,
             owed: [0.0; 3],
@@ -116,7 +116,7 @@ impl<C: Carrier> Crowd<C> {
     }
 
     /// Keeps the graph unchanged for this long, and sends only renewals of leases.
-    pub fn rest(&mut self, span: Duration) -> Result<()> {
+    pub fn idle(&mut self, span: Duration) -> Result<()> {
         let end = Instant::now() + span;
         while Instant::now() < end {
             self.tick(false)?;
@@ -164,13 +164,13 @@ impl<C: Carrier> Crowd<C> {
     }
 
     /// Returns the number of participants ever created.
-    pub fn born(&self) -> u32 {
-        self.born
+    pub fn participants_created(&self) -> u32 {
+        self.participants_created
     }
 
     /// Repeats disposals and every valid announcement, for an observer that missed some.
     pub fn repeat(&mut self) -> Result<()> {
-        for farewell in self.farewells.clone() {
+        for farewell in self.disposals.clone() {
             self.send(&farewell)?;
         }
         for index in 0..self.members.len() {
@@ -185,7 +185,7 @@ impl<C: Carrier> Crowd<C> {
 
     /// Forgets past disposals, which the observer has seen.
     pub fn forget(&mut self) {
-        self.farewells.clear();
+        self.disposals.clear();
     }
 
     fn tick(&mut self, changes: bool) -> Result<()> {
@@ -263,12 +263,12 @@ impl<C: Carrier> Crowd<C> {
     }
 
     fn birth(&mut self, node: String) -> Result<()> {
-        let staying = self.born < STAYING as u32;
+        let staying = self.participants_created < STAYING as u32;
         let slot = self.free_slot();
         let lease = if staying { 100 } else { self.lease() };
         let mut prefix = *b"\x01\x0fcrowd.....";
-        prefix[8..].copy_from_slice(&self.born.to_be_bytes());
-        self.born += 1;
+        prefix[8..].copy_from_slice(&self.participants_created.to_be_bytes());
+        self.participants_created += 1;
         let mut member = Member {
             prefix,
             slot,
@@ -328,7 +328,7 @@ impl<C: Carrier> Crowd<C> {
         if let Some(member) = self.take() {
             let message = member.disposal(SPDP_WRITER, 2, PARTICIPANT, self.dice.pick(2) == 0);
             self.send(&message)?;
-            self.farewells.push(message);
+            self.disposals.push(message);
             self.count_end(&member, "disposed");
         }
         Ok(())
@@ -365,7 +365,7 @@ impl<C: Carrier> Crowd<C> {
                 let number = member.next_number(entity);
                 let message = member.disposal(announcer(entity), number, entity, by_key);
                 self.count(role(entity), "disposed", 1);
-                self.farewells.push(message.clone());
+                self.disposals.push(message.clone());
                 message
             }
             None => {
@@ -407,7 +407,7 @@ impl<C: Carrier> Crowd<C> {
 
     fn send(&mut self, message: &[u8]) -> Result<()> {
         self.due = (self.due + Duration::from_secs_f64(1.0 / PACE)).max(Instant::now());
-        self.carrier.carry(message)?;
+        self.carrier.send(message)?;
         let ahead = self.due.saturating_duration_since(Instant::now());
         if ahead > Duration::from_millis(2) {
             std::thread::sleep(ahead);

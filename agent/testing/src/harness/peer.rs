@@ -293,7 +293,7 @@ impl Peer {
     }
 
     /// Lets a publisher send.
-    pub fn go(&mut self) -> Result<()> {
+    pub fn start_sending(&mut self) -> Result<()> {
         self.process.write_line("go")
     }
 

@@ -265,7 +265,7 @@ fn a_stopped_call_names_the_thread_that_continued_it() {
 #[test]
 fn a_call_beyond_the_quota_of_its_control_group_is_throttled() {
     let (mut robot, mut process) = started();
-    let _quota = Quota::a_twentieth_for(&process);
+    let _quota = Quota::limit_to_five_percent(&process);
     let calls = late(&mut robot, &mut process, "compute 5 200000");
     assert_cause(&calls, 5, Cause::Throttled, 0.4);
 }
@@ -375,7 +375,7 @@ fn measure_the_causes_of_a_hundred_calls_each() {
         if hog.is_some() {
             pin(&process);
         }
-        let _quota = is_beside("quota").then(|| Quota::a_twentieth_for(&process));
+        let _quota = is_beside("quota").then(|| Quota::limit_to_five_percent(&process));
         let (mut all, mut right, mut named) = (0, 0, 0);
         let mut truth = [Duration::ZERO; 2];
         let mut measured = [Duration::ZERO; 2];

@@ -11,7 +11,7 @@ pub struct Tapped {
 
 impl Tapped {
     pub fn new() -> Result<Self> {
-        let host = Namespace::alone()?;
+        let host = Namespace::isolated()?;
         let settings = WireTapSettings {
             selection: Selection::new(&[], &[])?,
             ring_bytes: 8 << 20,

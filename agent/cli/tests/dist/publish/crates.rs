@@ -43,7 +43,7 @@ fn cargo_installs_rp_from_the_published_crates_and_leaves_nothing() -> Result<()
         cargo.env("CARGO_TARGET_DIR", directory.path().join("target"));
         cargo
     };
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let began = Instant::now();
     let mut install = cargo("install");
     // Only the speed of the program depends on the profile.

@@ -27,7 +27,7 @@ impl<'a> Views<'a> {
             let began = Instant::now();
             let mut said = None;
             loop {
-                crowd.rest(Duration::from_millis(500))?;
+                crowd.idle(Duration::from_millis(500))?;
                 let is_late = began.elapsed() > PATIENCE;
                 if crowd.is_grey() && !is_late {
                     continue;
@@ -37,7 +37,7 @@ impl<'a> Views<'a> {
                 let answer = std::thread::scope(|scope| -> Result<Answer> {
                     let asked = scope.spawn(|| Answer::of(host));
                     while !asked.is_finished() {
-                        crowd.rest(Duration::from_millis(10))?;
+                        crowd.idle(Duration::from_millis(10))?;
                     }
                     asked.join().map_err(|_| anyhow!("nobody asked"))?
                 })?;
@@ -70,7 +70,7 @@ impl<'a> Views<'a> {
             "{} s: {} participants of {} compared",
             self.since.elapsed().as_secs(),
             crowd.size(),
-            crowd.born()
+            crowd.participants_created()
         );
         Ok(())
     }

@@ -44,7 +44,7 @@ os.waitpid(child, 0)
 
 #[test]
 fn libraries_and_processes_with_equal_identities_are_distinguished() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let program = TracedProgram::build(248, &[])?;
     let (built, library) = (program.program(), program.library());
@@ -147,7 +147,7 @@ fn started(host: &Namespace, programs: &[TracedProgram; 2], mode: u32) -> Result
 
 #[test]
 fn without_root_a_library_is_attached_by_its_path_unless_it_was_replaced() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let programs = [
         TracedProgram::build(248, &[])?,
@@ -188,7 +188,7 @@ fn without_root_a_library_is_attached_by_its_path_unless_it_was_replaced() -> Re
 #[test]
 fn the_packaged_broker_attaches_libraries_of_private_directories_also_replaced_ones() -> Result<()>
 {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let programs = [
         TracedProgram::build(248, &[])?,

@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use anyhow::{Result, anyhow, ensure};
 
-use super::{API_PORT, Counted, METRICS_PORT, Scene};
+use super::{API_PORT, Counted, METRICS_PORT, FaultBench};
 use ros2probe_capture::netns;
 use ros2probe_testing::harness::agent::ON_THE_WIRE;
 use ros2probe_testing::harness::network::{Link, Namespace};
@@ -98,7 +98,7 @@ fn misbehaving_receivers_and_scrapers_are_counted_and_lose_no_message() -> Resul
     ];
     let mut words = vec!["env"];
     words.extend(variables.iter().map(String::as_str));
-    let scene = Scene::start(&link.robot, &directory, &configuration, &words)?;
+    let scene = FaultBench::start(&link.robot, &directory, &configuration, &words)?;
     let mut counted = Counted::start(&link, 1, "talker")?;
     scene.node_is_known("/talker")?;
     let before = Usage::of(scene.pid())?;
@@ -107,7 +107,7 @@ fn misbehaving_receivers_and_scrapers_are_counted_and_lose_no_message() -> Resul
     let rounds = if long().is_some() { 600 } else { 6 };
     let mut most = 0;
     for _ in 0..rounds {
-        counted.talk(320, 200)?;
+        counted.send_samples(320, 200)?;
         most = most.max(Usage::of(scene.pid())?.memory.unreclaimable);
     }
     counted.check(&scene.agent)?;
@@ -151,7 +151,7 @@ fn a_crowd_of_scrapers_and_clients_is_bounded_and_leaves_nothing_behind() -> Res
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let configuration = format!("watch: [/**]\n{ON_THE_WIRE}");
-    let scene = Scene::start(&link.robot, &directory, &configuration, &[])?;
+    let scene = FaultBench::start(&link.robot, &directory, &configuration, &[])?;
     let mut counted = Counted::start(&link, 1, "talker")?;
     scene.node_is_known("/talker")?;
     let before = Usage::of(scene.pid())?;
@@ -170,7 +170,7 @@ fn a_crowd_of_scrapers_and_clients_is_bounded_and_leaves_nothing_behind() -> Res
             crowd.push(stream);
         }
     }
-    counted.talk(320, 500)?;
+    counted.send_samples(320, 500)?;
     let (most, after) = (open()?, Usage::of(scene.pid())?);
     ensure!(
         most <= descriptors + PLACES,
@@ -219,7 +219,7 @@ fn a_crowd_of_scrapers_and_clients_is_bounded_and_leaves_nothing_behind() -> Res
 }
 
 /// Opens slow connections of every kind.
-fn scrapers(scene: &Scene<'_>) -> Result<Vec<TcpStream>> {
+fn scrapers(scene: &FaultBench<'_>) -> Result<Vec<TcpStream>> {
     let mut all = Vec::new();
     for number in 0..SLOW {
         for port in [METRICS_PORT, API_PORT] {

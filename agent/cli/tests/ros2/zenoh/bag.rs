@@ -26,7 +26,7 @@ const RELIABLE: [&str; 2] = ["0", "RELIABLE"];
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp, ros2bag, rosbag2_storage_mcap: make test-ros2"]
 fn a_bag_has_each_message_byte_for_byte_and_ros2_plays_it() -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
     let agent = host.agent("watch: []\n")?;
     let _router = host.router("")?;

@@ -67,7 +67,7 @@ impl Robot {
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
 fn connections_over_tls_are_reported_and_their_messages_counted_inside() -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
     let agent = host.agent_inside(WATCH)?;
     let mut robot = Robot::start(&host, "tls")?;
@@ -99,7 +99,7 @@ fn connections_over_tls_are_reported_and_their_messages_counted_inside() -> Resu
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
 fn connections_over_quic_are_reported() -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
     let agent = host.agent(WATCH)?;
     let mut robot = Robot::start(&host, "quic")?;

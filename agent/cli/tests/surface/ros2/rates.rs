@@ -12,7 +12,7 @@ use serde_json::Value;
 use super::{run, stderr, stdout};
 
 /// Time in seconds after which the recorded command of ros2cli was stopped.
-const LASTED: f64 = 7.0;
+const RECORDED_SECONDS: f64 = 7.0;
 
 /// A row of the list of tolerances.
 #[derive(Debug)]
@@ -206,7 +206,7 @@ impl Recorded {
             assert_eq!(line.len(), original.len(), "{said}");
             let mut before = "";
             for (word, original) in line.iter().zip(&original) {
-                let same = tolerance.admits(before, word, original);
+                let same = tolerance.is_within(before, word, original);
                 assert!(same, "`{before} {word}` is not `{original}`: {said}");
                 before = word;
             }
@@ -216,7 +216,7 @@ impl Recorded {
     /// Returns standard output and standard error of the same command on a capture.
     fn replayed(&self, capture: &Path, tolerance: &Tolerance) -> (String, String) {
         let from = format!("{:.9}", self.start + tolerance.start_up);
-        let until = format!("{:.9}", self.start + LASTED);
+        let until = format!("{:.9}", self.start + RECORDED_SECONDS);
         let mut words: Vec<&str> = self.arguments.iter().map(String::as_str).collect();
         words.extend(["--distro", "humble", "--replay", capture.to_str().unwrap()]);
         words.extend(["--from", &from, "--until", &until]);
@@ -226,7 +226,7 @@ impl Recorded {
 }
 
 impl Tolerance {
-    fn admits(&self, before: &str, word: &str, original: &str) -> bool {
+    fn is_within(&self, before: &str, word: &str, original: &str) -> bool {
         let (Some(value), Some(wanted)) = (number(word), number(original)) else {
             return word == original;
         };

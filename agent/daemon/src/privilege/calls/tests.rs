@@ -191,11 +191,11 @@ fn only_threads_with_connections_create_sockets_of_the_allowed_kinds() {
 #[test]
 fn an_accepted_connection_cannot_be_redirected() {
     for role in [Role::Serve, Role::Ros2Daemon] {
-        cannot_lead_elsewhere(role);
+        check_connections_refused(role);
     }
 }
 
-fn cannot_lead_elsewhere(role: Role) {
+fn check_connections_refused(role: Role) {
     let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let elsewhere = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let _client = std::net::TcpStream::connect(listener.local_addr().unwrap()).unwrap();

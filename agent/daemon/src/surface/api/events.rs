@@ -220,7 +220,7 @@ impl Stream {
         for record in batch
             .records
             .iter()
-            .filter(|record| self.filter.wants(record))
+            .filter(|record| self.filter.is_selected(record))
         {
             let message = Event::default()
                 .event(record.definition.name)
@@ -292,7 +292,7 @@ impl Filter {
         })
     }
 
-    fn wants(&self, record: &Record) -> bool {
+    fn is_selected(&self, record: &Record) -> bool {
         let name = record.definition.name;
         let named = self.names.is_empty() || self.names.iter().any(|each| covers(each, name));
         named

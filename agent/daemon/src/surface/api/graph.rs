@@ -54,7 +54,7 @@ fn graph(snapshot: &Snapshot, scope: Scope) -> Graph {
     let mut drawing = GraphBuilder::default();
     for node in &snapshot.nodes {
         let is_hidden = node.name.split('/').any(|token| token.starts_with('_'));
-        if scope.admits(node.domain_id) && (scope.shows_hidden() || !is_hidden) {
+        if scope.includes(node.domain_id) && (scope.shows_hidden() || !is_hidden) {
             drawing.vertex(VertexKind::Node, node.domain_id.0, &node.name);
         }
     }
@@ -63,7 +63,7 @@ fn graph(snapshot: &Snapshot, scope: Scope) -> Graph {
             topic.kind,
             TopicKind::ServiceRequest | TopicKind::ServiceReply | TopicKind::Discovery
         );
-        let is_shown = scope.admits(topic.domain_id) && (scope.shows_hidden() || !topic.hidden);
+        let is_shown = scope.includes(topic.domain_id) && (scope.shows_hidden() || !topic.hidden);
         if is_topic && is_shown && !topic.vanished {
             drawing.topic(topic);
         }

@@ -326,7 +326,7 @@ fn view(recording: &Recording) -> answers::Recording {
         file_bytes: status.file_bytes,
         files: status.files,
         error: status.error,
-        topics: recording.asked.clone(),
+        topics: recording.requested.clone(),
         report: status.report,
     }
 }

@@ -66,7 +66,7 @@ async fn list(
     let answers = TopicAnswers::new(&state, &in_force);
     let topics = answers.snapshot.topics.iter().filter(|topic| {
         let is_plain = matches!(topic.kind, TopicKind::Topic | TopicKind::Dds) && !topic.hidden;
-        scope.admits(topic.domain_id) && (is_plain || scope.shows_hidden())
+        scope.includes(topic.domain_id) && (is_plain || scope.shows_hidden())
     });
     let answer = TopicList {
         timestamp_seconds: answers.snapshot.time().seconds(),

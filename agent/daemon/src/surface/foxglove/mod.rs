@@ -85,7 +85,7 @@ struct Shared {
 #[derive(Clone)]
 struct ListenerState {
     shared: Arc<Shared>,
-    door: Arc<AccessRules>,
+    access_rules: Arc<AccessRules>,
     origins: Arc<[String]>,
     places: Arc<Places>,
     tasks: TaskTracker,
@@ -160,7 +160,7 @@ impl Server {
         let shared = Arc::new(Shared::new(&context));
         let gate = ListenerState {
             shared: Arc::clone(&shared),
-            door: Arc::new(door),
+            access_rules: Arc::new(door),
             origins: self.origins,
             places: Arc::new(Places::new(
                 context.limits.caps().get(Limit::FoxgloveClients),
@@ -255,11 +255,11 @@ async fn open(State(gate): State<ListenerState>, request: Request) -> Response {
     };
     let offered = token.as_deref().map(str::as_bytes);
     let granted =
-        gate.door
+        gate.access_rules
             .check_viewer(request.headers(), offered, &gate.origins, Instant::now());
     let granted = match granted {
         Ok(granted) => granted,
-        Err(problem) => return refused(turned_away(problem)),
+        Err(problem) => return refused(refusal(problem)),
     };
     let response = match handshake::accept(&request) {
         Ok(response) => response,
@@ -269,7 +269,7 @@ async fn open(State(gate): State<ListenerState>, request: Request) -> Response {
         let detail = "all places for viewers without a token are taken, a quarter of \
                       limits.foxglove_clients is for others: add `?token=TOKEN` to the address, as \
                       `rp foxglove` prints it";
-        return refused(turned_away(Problem::new(Code::TooManyClients, detail)));
+        return refused(refusal(Problem::new(Code::TooManyClients, detail)));
     };
     let upgrade = hyper::upgrade::on(&mut request);
     let ListenerState { shared, tasks, .. } = gate;
@@ -291,7 +291,7 @@ async fn open(State(gate): State<ListenerState>, request: Request) -> Response {
     response
 }
 
-fn turned_away(problem: Problem) -> Response {
+fn refusal(problem: Problem) -> Response {
     let close = [(CONNECTION, HeaderValue::from_static("close"))];
     (close, problem).into_response()
 }

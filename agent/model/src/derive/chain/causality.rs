@@ -169,7 +169,7 @@ impl Causality {
                 let known = latest.filter_map(|hop| hop.traced);
                 match decision {
                     Decision::Share(share) => step.begin(share, known, tracer),
-                    Decision::Hop(before) => Some(step.go_on(before, known, tracer)),
+                    Decision::Hop(before) => Some(step.continue_spans(before, known, tracer)),
                 }
             });
         self.publications.push_back(Hop {

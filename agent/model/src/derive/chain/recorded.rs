@@ -56,7 +56,7 @@ pub struct RecordedChains {
     /// Whether publication times differ from log times, and whether some message has no publication
     /// time.
     has_published: bool,
-    lacks_published: bool,
+    misses_publish_times: bool,
     rounded: u64,
     refused: u64,
     is_full: bool,
@@ -131,7 +131,7 @@ impl RecordedChains {
             messages: Vec::new(),
             ends: Vec::new(),
             has_published: false,
-            lacks_published: false,
+            misses_publish_times: false,
             rounded: 0,
             refused: 0,
             is_full: false,
@@ -152,7 +152,7 @@ impl RecordedChains {
         self.elapsed = self.elapsed.saturating_add(step);
         self.close(self.elapsed);
         let published = published.filter(|published| published.0 > 0);
-        self.lacks_published |= published.is_none();
+        self.misses_publish_times |= published.is_none();
         self.has_published |= published.is_some_and(|published| published != logged);
         if stamp == (0, 0) {
             return;
@@ -196,7 +196,7 @@ impl RecordedChains {
     #[must_use]
     pub fn finish(mut self, preferred: &[&str]) -> RecordedFacts {
         self.close(Duration::MAX);
-        let times = match self.has_published && !self.lacks_published {
+        let times = match self.has_published && !self.misses_publish_times {
             true => Times::Publish,
             false => Times::Log,
         };

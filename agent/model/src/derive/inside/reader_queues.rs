@@ -44,7 +44,7 @@ impl Inside {
                     }
                     None => ReaderQueue::new(&arrivals, &takes, now),
                 };
-                self.topics.lose(&key, lost);
+                self.topics.add_queue_losses(&key, lost);
                 process.queues.insert(key, queue);
             }
             // The remaining queues can no longer be compared, so their findings end.

@@ -8,7 +8,7 @@ use ros2probe_wire::diagnostics::{self as wire, DiagnosticLevel, DiagnosticStatu
 use ros2probe_wire::{DomainId, Guid, WireError};
 
 use super::Origin;
-use super::text::bounded;
+use super::text::truncated_text;
 use crate::facts::bounded::{Bounded, Counted, Sum, TableFacts};
 use crate::facts::diagnosis::Diagnosis;
 use crate::facts::event::{EventKind, Events};
@@ -91,8 +91,8 @@ impl Diagnostics {
         status: &wire::DiagnosticStatus<'_>,
         events: &mut Events,
     ) {
-        let name = bounded(status.name, MAX_NAME).into();
-        let hardware_id = bounded(status.hardware_id, MAX_NAME).into();
+        let name = truncated_text(status.name, MAX_NAME).into();
+        let hardware_id = truncated_text(status.hardware_id, MAX_NAME).into();
         let key = (origin.domain_id, origin.topic.clone(), name, hardware_id);
         if let Some((_, silent)) = self.parts.make_room(&key, |part| part.status.at) {
             self.removed(&silent);
@@ -115,7 +115,7 @@ impl Diagnostics {
             node: origin.node.cloned(),
             writer: origin.writer,
             level,
-            message: bounded(status.message, MAX_TEXT).into(),
+            message: truncated_text(status.message, MAX_TEXT).into(),
             values: self.values(status),
             at: origin.at,
             since,
@@ -138,7 +138,7 @@ impl Diagnostics {
         let mut values = Vec::new();
         let mut bytes = 0;
         for (key, value) in status.values.clone().take(MAX_STATUS_VALUES) {
-            let (key, value) = (bounded(key, MAX_NAME), bounded(value, MAX_TEXT));
+            let (key, value) = (truncated_text(key, MAX_NAME), truncated_text(value, MAX_TEXT));
             bytes += key.len() + value.len();
             if bytes > self.value_bytes.room() {
                 self.value_bytes.refuse();

@@ -7,7 +7,7 @@ use std::time::Duration;
 use foldhash::HashMap;
 use ros2probe_wire::{DomainId, Guid, header};
 
-use super::text::bounded;
+use super::text::truncated_text;
 use super::transforms::{NAME, MAX_NAMED, Transforms, without_slash};
 use crate::facts::bounded::{Bounded, Counted, TableFacts};
 use crate::facts::diagnosis::Diagnosis;
@@ -66,7 +66,7 @@ impl Frames {
     pub(super) fn read(&mut self, writer: Guid, payload: &[u8]) {
         if let Some(known) = self.writers.get_mut(&writer) {
             let frame = header::frame_id(payload).unwrap_or_default();
-            known.frame = Some(without_slash(&bounded(frame, NAME)).into());
+            known.frame = Some(without_slash(&truncated_text(frame, NAME)).into());
         }
     }
 

@@ -7,7 +7,7 @@ use ros2probe_wire::log::{Log, LogLevel};
 use ros2probe_wire::{DomainId, Guid, SequenceNumber};
 
 use super::Origin;
-use super::text::bounded;
+use super::text::truncated_text;
 use crate::facts::bounded::{Bounded, Counted, TableFacts};
 use crate::facts::diagnosis::Diagnosis;
 use crate::facts::model_time::ModelTime;
@@ -124,7 +124,7 @@ pub struct LogFacts {
 impl Logs {
     /// Adds a message.
     pub fn add(&mut self, origin: &Origin<'_>, log: &Log<'_>) {
-        let logger = bounded(log.logger, MAX_NAME);
+        let logger = truncated_text(log.logger, MAX_NAME);
         let node = match origin.node {
             Some(node) => node.clone(),
             None => NodeName::from(format!("/{}", logger.replace('.', "/"))),
@@ -138,9 +138,9 @@ impl Logs {
             node: node.clone(),
             level: log.level,
             logger,
-            text: bounded(log.text, MAX_TEXT),
-            file: bounded(log.file, MAX_NAME),
-            function: bounded(log.function, MAX_NAME),
+            text: truncated_text(log.text, MAX_TEXT),
+            file: truncated_text(log.file, MAX_NAME),
+            function: truncated_text(log.function, MAX_NAME),
             line: log.line,
         });
         self.latest.push_back(Arc::clone(&message));

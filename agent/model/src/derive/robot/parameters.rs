@@ -11,7 +11,7 @@ use ros2probe_wire::ros_parameters::{
 use ros2probe_wire::{DomainId, Guid, WireError};
 
 use super::Origin;
-use super::text::bounded;
+use super::text::truncated_text;
 use crate::derive::services::service::CallId;
 use crate::facts::bounded::{Bounded, Counted, TableFacts};
 use crate::facts::diagnosis::Diagnosis;
@@ -221,10 +221,10 @@ impl Parameters {
         event: ParameterEvent<'_>,
         events: &mut Events,
     ) -> Result<(), WireError> {
-        let node = NodeName::from(&*bounded(event.node, MAX_NAME));
+        let node = NodeName::from(&*truncated_text(event.node, MAX_NAME));
         for change in event.changes {
             let change = change?;
-            let name = bounded(change.parameter.name, MAX_NAME).into();
+            let name = truncated_text(change.parameter.name, MAX_NAME).into();
             let key = (origin.domain_id, node.clone(), name);
             self.change(origin, key, &change, events);
         }
@@ -295,7 +295,7 @@ impl Parameters {
             return Ok(());
         };
         for (index, name) in names.enumerate() {
-            let name = bounded(name?, MAX_NAME).into();
+            let name = truncated_text(name?, MAX_NAME).into();
             self.requested_values.push_back(RequestedParameter { call, index, name });
         }
         Ok(())
@@ -352,7 +352,7 @@ impl Parameters {
         let node = NodeName::from(node);
         for parameter in parameters {
             let parameter = parameter?;
-            let name = bounded(parameter.name, MAX_NAME).into();
+            let name = truncated_text(parameter.name, MAX_NAME).into();
             self.requests.push_back(Request {
                 key: (origin.domain_id, node.clone(), name),
                 value: text(&parameter.value),

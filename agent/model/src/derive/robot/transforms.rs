@@ -14,7 +14,7 @@ use ros2probe_wire::transforms::{Transform, Transforms as Message};
 use ros2probe_wire::{DomainId, Guid, WireError};
 
 use super::Origin;
-use super::text::bounded;
+use super::text::truncated_text;
 use crate::facts::bounded::{Bounded, Counted, Sum, TableFacts};
 use crate::facts::diagnosis::Diagnosis;
 use crate::facts::event::{EventKind, Events};
@@ -259,7 +259,7 @@ impl Tree {
                     edges.refuse();
                     return;
                 }
-                let child: Arc<str> = without_slash(&bounded(transform.child, NAME)).into();
+                let child: Arc<str> = without_slash(&truncated_text(transform.child, NAME)).into();
                 let edge = self.edges.entry(child).or_default();
                 edges.add(usize::from(edge.is_new()));
                 edge
@@ -268,7 +268,7 @@ impl Tree {
         let Some(jump) = edge.add(origin, transform, is_static) else {
             return;
         };
-        let child = bounded(transform.child, NAME);
+        let child = truncated_text(transform.child, NAME);
         events.push(
             origin.at,
             EventKind::TransformJump {

@@ -173,7 +173,7 @@ fn some_paths_prove_that_the_sender_is_on_this_host() {
             interface,
             ..of_data(flags)
         };
-        assert_eq!(sample(&record).head.leaves(), leaves, "{flags:#x}");
+        assert_eq!(sample(&record).head.is_outgoing(), leaves, "{flags:#x}");
     }
 }
 

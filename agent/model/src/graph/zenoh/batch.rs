@@ -20,7 +20,7 @@ const MIN_FREE_BYTES: usize = 4 << 20;
 /// Time without a FRAGMENT after which a message is given up if memory is needed.
 const STALE_AFTER: Duration = Duration::from_secs(10);
 /// Minimum time between two searches for stale messages.
-const GIVE_UP_INTERVAL: Duration = Duration::from_secs(1);
+const STALE_SEARCH_INTERVAL: Duration = Duration::from_secs(1);
 
 impl Zenoh {
     pub(super) fn batch(
@@ -106,15 +106,15 @@ impl Zenoh {
     }
 
     /// Gives up messages whose FRAGMENTs have stopped arriving, at most once a second.
-    fn give_up_chains(&mut self, now: ModelTime) {
-        if now < self.last_stale_search + GIVE_UP_INTERVAL {
+    fn drop_stale_chains(&mut self, now: ModelTime) {
+        if now < self.last_stale_search + STALE_SEARCH_INTERVAL {
             return;
         }
         self.last_stale_search = now;
         let before = now - STALE_AFTER;
         for direction in self.directions.values_mut() {
             let held = direction.held();
-            self.counters.incomplete += direction.give_up(before) as u64;
+            self.counters.incomplete += direction.drop_message(before) as u64;
             self.chain_bytes.sub(held - direction.held());
         }
     }
@@ -127,7 +127,7 @@ impl Zenoh {
         show: &mut impl FnMut(ReportFact<'_>),
     ) {
         if self.chain_bytes.room() < MIN_FREE_BYTES {
-            self.give_up_chains(place.time);
+            self.drop_stale_chains(place.time);
         }
         let is_wanted = |beginning: &[u8]| match NetworkMessage::beginning(beginning) {
             Ok(NetworkMessage::Push(push)) => match push.sample {

@@ -61,7 +61,7 @@ impl Zenoh {
         let key = key.and_then(|key| self.resolve(stream, key));
         let domain = key.and_then(|alias| domain_of_graph(&alias.key));
         if let (Some(domain), Some(direction)) = (domain, self.directions.get_mut(stream)) {
-            direction.asked = Some((interest.id, domain));
+            direction.requested_interest = Some((interest.id, domain));
         }
     }
 

@@ -91,7 +91,7 @@ pub(super) struct StreamState {
     /// The receiving router, if its id is known.
     pub(super) receiver: Option<Side>,
     /// Number and domain of the sender's last INTEREST in the graph of a domain.
-    pub(super) asked: Option<(u32, DomainId)>,
+    pub(super) requested_interest: Option<(u32, DomainId)>,
     pub(super) lease: Option<Duration>,
     pub(super) chains: Bounded<ZenohChains, Vec<Chain>>,
     /// Whether the sender has sent CLOSE, or closed the connection.
@@ -272,7 +272,7 @@ impl StreamState {
     }
 
     /// Gives up messages without a FRAGMENT since `before`, and returns their number.
-    pub(super) fn give_up(&mut self, before: ModelTime) -> usize {
+    pub(super) fn drop_message(&mut self, before: ModelTime) -> usize {
         let all = self.chains.len();
         self.chains.retain(|chain| chain.last >= before);
         all - self.chains.len()

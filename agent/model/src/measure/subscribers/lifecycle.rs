@@ -84,7 +84,7 @@ impl Subscribers {
 
     /// Drops at most `count` deliveries whose last observation is not after `until`. Returns the
     /// number of dropped deliveries.
-    pub fn give_up(
+    pub fn drop_oldest(
         &mut self,
         until: ModelTime,
         count: usize,

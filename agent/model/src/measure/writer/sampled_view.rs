@@ -30,7 +30,7 @@ impl Writer {
     }
 
     /// Returns whether the sample was pending when the sampled view ended.
-    pub(super) fn is_under_way(&self, sample: &Sample) -> bool {
+    pub(super) fn is_pending(&self, sample: &Sample) -> bool {
         let (at, number) = (sample.head.at, sample.sequence_number);
         self.sampled
             .as_ref()

@@ -56,7 +56,7 @@ impl Observer {
 
     /// Stops capturing a writer of requests or replies that has exceeded its budget.
     pub(super) fn follow_call(&mut self, writer: Guid, is_over_budget: bool) {
-        if is_over_budget && !self.measure.payloads.wants_bytes(writer) {
+        if is_over_budget && !self.measure.payloads.needs_payload(writer) {
             let is_measured = self.measure.profiler.get(writer).is_some();
             let verdict = match is_measured {
                 true => Verdict::Meter,

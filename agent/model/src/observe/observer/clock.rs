@@ -12,7 +12,7 @@ use super::MAX_CLOCK_STEP;
 use super::Observer;
 use super::TICK;
 use crate::facts::diagnosis;
-use crate::facts::event::{EventKind, MAX_TEXT, bounded, bounded_finding};
+use crate::facts::event::{EventKind, MAX_TEXT, truncated, bounded_finding};
 use crate::facts::loss_share::LossShare;
 use crate::facts::measurement::Measurement;
 use crate::facts::model_time::ModelTime;
@@ -62,7 +62,7 @@ impl Observer {
             .settle(self.clock, &mut self.journal, graph);
         self.report_missing();
         for writer in self.measure.payloads.unsettled() {
-            self.measure.payloads.give_all(writer, self.clock);
+            self.measure.payloads.dispatch_all(writer, self.clock);
         }
         self.end_second_of_losses();
         self.report_losses();
@@ -246,7 +246,7 @@ impl Observer {
             };
             let seeming_silence = |slowest| {
                 let polled = writers.iter();
-                let longest = polled.map(|each| each.writer.seeming_silence(slowest));
+                let longest = polled.map(|each| each.writer.max_unseen_time(slowest));
                 let longest = longest.max().unwrap_or_default();
                 let is_unseen = |guid: &&Guid| {
                     let known = self.measure.profiler.get(**guid);
@@ -286,7 +286,7 @@ impl Observer {
                 let kind = EventKind::Expectation {
                     domain_id,
                     topic: name.bounded(MAX_TEXT),
-                    watch: bounded(&watch.pattern).into(),
+                    watch: truncated(&watch.pattern).into(),
                     from,
                     to,
                     violations: judgement.violations(),
@@ -296,7 +296,7 @@ impl Observer {
                     let kind = EventKind::Silence {
                         domain_id,
                         topic: name.bounded(MAX_TEXT),
-                        watch: bounded(&watch.pattern).into(),
+                        watch: truncated(&watch.pattern).into(),
                         last_message: last_message.map(|at| self.graph.wall_clock.wall_time(at)),
                     };
                     self.journal.events.push(now, kind);

@@ -213,7 +213,7 @@ impl Observer {
                 let is_read = self.derive.robot.is_captured(guid);
                 let verdict = match topic.naming.kind {
                     TopicKind::Discovery => Verdict::Capture,
-                    _ if measured && counts && wants_bytes(topic) => Verdict::Capture,
+                    _ if measured && counts && needs_payload(topic) => Verdict::Capture,
                     _ if is_call || is_read || latched == Some(Verdict::Capture) => {
                         Verdict::Capture
                     }
@@ -327,7 +327,7 @@ impl Observer {
 }
 
 /// Returns whether a subscription requests the payloads of the topic.
-pub(super) fn wants_bytes(topic: &Topic) -> bool {
+pub(super) fn needs_payload(topic: &Topic) -> bool {
     let requested = topic.requested.as_ref();
     requested.is_some_and(|requested| !requested.payloads.is_empty())
 }

@@ -83,14 +83,14 @@ impl Observer {
     }
 
     /// Dispatches a retransmitted sample that was first counted before its writer's announcement.
-    pub(super) fn came_again(&mut self, sample: &Sample) {
+    pub(super) fn note_retransmitted(&mut self, sample: &Sample) {
         let (writer, at) = (sample.head.writer, sample.head.at);
         let number = sample.sequence_number;
         let stamp = match sample.content {
             Content::Data { .. } => sample.header_stamp,
             Content::DataFrag(_) => None,
         };
-        if !sample.is_delivered() || !self.measure.payloads.lacks(writer, number) {
+        if !sample.is_delivered() || !self.measure.payloads.is_undispatched(writer, number) {
             return;
         }
         let has_header = |known: &Measured| known.writer.traits().has_header;
@@ -106,7 +106,7 @@ impl Observer {
         };
         let progress = self.measure.profiler.progress(writer, at, &self.graph);
         if let Some(progress) =
-            progress.filter(|_| sample.is_end() || self.measure.payloads.wants_bytes(writer))
+            progress.filter(|_| sample.is_end() || self.measure.payloads.needs_payload(writer))
         {
             let skip = self
                 .measure
@@ -134,9 +134,9 @@ impl Observer {
     /// Keeps the payload of a sample that is not counted yet, if it is requested.
     pub(super) fn keep_payload(&mut self, sample: &Sample, payload: &[u8]) {
         let writer = sample.head.writer;
-        if self.measure.payloads.wants_bytes(writer) {
+        if self.measure.payloads.needs_payload(writer) {
             let known = self.measure.profiler.get(writer);
-            let lacks = self.measure.payloads.lacks(writer, sample.sequence_number);
+            let lacks = self.measure.payloads.is_undispatched(writer, sample.sequence_number);
             if lacks || known.is_some_and(|known| !known.writer.has(sample)) {
                 self.measure.payloads.keep(sample, payload);
             }

@@ -43,7 +43,7 @@ impl Observer {
         let mut zenoh = std::mem::take(&mut self.zenoh);
         let at = self.graph.wall_clock.model_time(report.time);
         let mut alive = None;
-        let wants_bytes = self.measure.payloads.wants_any_bytes()
+        let wants_bytes = self.measure.payloads.needs_any_payload()
             || self.measure.latched.is_used()
             || self.derive.robot.is_used();
         // A sample may precede its writer's announcement in a batch. It then has an unknown writer.

@@ -130,7 +130,7 @@ fn late(process: u32, now: u64) -> impl Iterator<Item = LateCall> {
 /// [`Limits::INSIDE_BYTES`].
 #[test]
 fn figures_from_inside_processes_are_below_their_share_of_the_memory_limit() {
-    let _alone = ALONE.lock().unwrap();
+    let _alone = MEASUREMENT_LOCK.lock().unwrap();
     let before = resident();
     let mut observer = Observer::new(Settings::default());
     let watches = Watchlist::new(vec![Watch::named("/none").unwrap()]).unwrap();

@@ -7,7 +7,7 @@ use ros2probe_wire::Guid;
 use ros2probe_wire::transforms::{Pose, Transform};
 
 use super::{NAME, Origin, without_slash};
-use crate::derive::robot::text::bounded;
+use crate::derive::robot::text::truncated_text;
 use crate::facts::bounded::Bounded;
 use crate::facts::model_time::ModelTime;
 use crate::facts::names::NodeName;
@@ -154,7 +154,7 @@ impl Edge {
     ) -> Option<TransformJump> {
         let parent = match &self.last {
             Some(last) if last.parent.as_bytes() == transform.parent => Arc::clone(&last.parent),
-            _ => without_slash(&bounded(transform.parent, NAME)).into(),
+            _ => without_slash(&truncated_text(transform.parent, NAME)).into(),
         };
         let went_back = self.note_broadcaster(origin, transform.stamp);
         self.count += 1;
