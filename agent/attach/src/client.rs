@@ -16,7 +16,9 @@ use rustix::net::{
 use crate::functions::{Calls, Library};
 use crate::mapped::Use;
 use crate::message::{receive, send};
-use crate::request::{Activity, Answer, MAX_PROCESSES, Means, Numbered, REQUEST_TIMEOUT, Place, Request};
+use crate::request::{
+    Activity, Answer, MAX_PROCESSES, Means, Numbered, Place, REQUEST_TIMEOUT, Request,
+};
 use crate::server::Peer;
 use crate::server::answer::answer;
 

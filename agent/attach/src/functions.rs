@@ -68,7 +68,8 @@ const RUNTIME: [&str; 10] = [
 /// `SharedMemTransport::copy_to_shared_buffer`, called once per message that goes into shared
 /// memory. Its caller `send` is called for all other messages, too. The parameters follow in the
 /// mangled name.
-pub const FAST_DDS_COPY: &str = "_ZN8eprosima7fastdds4rtps18SharedMemTransport21copy_to_shared_bufferE";
+pub const FAST_DDS_COPY: &str =
+    "_ZN8eprosima7fastdds4rtps18SharedMemTransport21copy_to_shared_bufferE";
 /// `(unsigned char const*, unsigned int, ..)`: Fast DDS 2.x.
 pub(crate) const CONTIGUOUS_PARAMETERS: &str = "PKhj";
 /// `(std::vector<NetworkBuffer> const&, unsigned int, ..)`: Fast DDS 3.x.
@@ -132,8 +133,15 @@ impl Calls {
     pub fn programs(self) -> Vec<(&'static str, &'static str)> {
         let same = |name: &&'static str| (*name, *name);
         match self {
-            Self::SharedMemory => vec![("shm_handed", CONTIGUOUS_PARAMETERS), ("shm_handed_list", BUFFER_LIST_PARAMETERS)],
-            Self::Messages => MESSAGES.iter().map(same).chain([RECEPTION_PROGRAM]).collect(),
+            Self::SharedMemory => vec![
+                ("shm_handed", CONTIGUOUS_PARAMETERS),
+                ("shm_handed_list", BUFFER_LIST_PARAMETERS),
+            ],
+            Self::Messages => MESSAGES
+                .iter()
+                .map(same)
+                .chain([RECEPTION_PROGRAM])
+                .collect(),
             Self::Callbacks | Self::Initialization | Self::Runtime => {
                 MESSAGES.iter().chain(&CALLBACKS).map(same).collect()
             }

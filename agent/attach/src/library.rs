@@ -11,7 +11,7 @@ use std::os::unix::fs::FileExt as _;
 
 use ros2probe_wire::{Cursor, Endianness, WireError};
 
-use crate::functions::{FAST_DDS_COPY as FUNCTION, BUFFER_LIST_PARAMETERS, CONTIGUOUS_PARAMETERS};
+use crate::functions::{BUFFER_LIST_PARAMETERS, CONTIGUOUS_PARAMETERS, FAST_DDS_COPY as FUNCTION};
 
 const MACHINE: u16 = if cfg!(target_arch = "aarch64") {
     183
@@ -208,7 +208,8 @@ impl Header {
         let segment_count = cursor.u16("e_phnum")?;
         let section_size = cursor.u16("e_shentsize")?;
         let section_count = cursor.u16("e_shnum")?;
-        let is_known = usize::from(segment_size) == SEGMENT_LEN && usize::from(section_size) == SECTION_LEN;
+        let is_known =
+            usize::from(segment_size) == SEGMENT_LEN && usize::from(section_size) == SECTION_LEN;
         if !is_known || segment_count.max(section_count) > MAX_ENTRIES {
             return Err(LibraryError::Foreign);
         }

@@ -60,7 +60,9 @@ impl Use {
             let Some(path) = line.find('/').and_then(|at| line.get(at..)) else {
                 continue;
             };
-            found.shares |= SHARED_MEMORY_PREFIXES.iter().any(|start| path.starts_with(start));
+            found.shares |= SHARED_MEMORY_PREFIXES
+                .iter()
+                .any(|start| path.starts_with(start));
             let name = path.rsplit('/').next().unwrap_or_default();
             let is_library = library.has_name(name.strip_suffix(DELETED_SUFFIX).unwrap_or(name));
             let mut fields = line.split_ascii_whitespace();

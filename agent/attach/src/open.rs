@@ -112,7 +112,10 @@ pub fn installed(library: Library) -> Vec<PathBuf> {
 }
 
 fn directories() -> Vec<PathBuf> {
-    let distributions = fs::read_dir(DISTRIBUTIONS_PATH).into_iter().flatten().flatten();
+    let distributions = fs::read_dir(DISTRIBUTIONS_PATH)
+        .into_iter()
+        .flatten()
+        .flatten();
     let distributions = distributions.take(MAX_DISTRIBUTIONS);
     let distributions = distributions.map(|entry| entry.path().join("lib"));
     LIBRARY_DIRECTORIES

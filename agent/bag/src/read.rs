@@ -223,7 +223,9 @@ pub fn scan(path: &Path, expansion: Expansion, each: &mut Visitor<'_>) -> Result
         expansion,
         in_memory: match compression {
             Compression::None => u64::MAX,
-            Compression::Lz4 | Compression::Zstd => expansion.limit(length, EXPANSION_FACTOR_IN_MEMORY),
+            Compression::Lz4 | Compression::Zstd => {
+                expansion.limit(length, EXPANSION_FACTOR_IN_MEMORY)
+            }
         },
     };
     let mut magic = Vec::new();
@@ -495,7 +497,8 @@ enum Next {
 impl Records<'_> {
     /// Returns the number of bytes to which a chunk of this length may expand in memory.
     const fn in_memory(&self, length: usize) -> u64 {
-        self.expansion.limit(length as u64, EXPANSION_FACTOR_IN_MEMORY)
+        self.expansion
+            .limit(length as u64, EXPANSION_FACTOR_IN_MEMORY)
     }
 
     fn next(&mut self, content: &mut Vec<u8>) -> io::Result<Next> {

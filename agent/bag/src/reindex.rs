@@ -154,8 +154,8 @@ fn files(directory: &Path) -> Result<Vec<String>, ReindexError> {
     Ok(names)
 }
 
-/// Returns the number of a file: `12` for `bag_12.mcap`, and for `12_bag_2026_05_22-10_11_58.mcap`, as
-/// Lyrical names it. Files without a number are first.
+/// Returns the number of a file: `12` for `bag_12.mcap`, and for `12_bag_2026_05_22-10_11_58.mcap`,
+/// as Lyrical names it. Files without a number are first.
 fn number(name: &str) -> Option<u64> {
     let (stem, _) = name.split_once(".mcap")?;
     match stem.split_once('_') {

@@ -368,14 +368,24 @@ impl Writer {
     #[must_use]
     pub fn bytes(&self) -> u64 {
         let current = self.current.as_ref().map_or(0, FileWriter::position);
-        current + self.complete_files.iter().map(|file| file.bytes).sum::<u64>()
+        current
+            + self
+                .complete_files
+                .iter()
+                .map(|file| file.bytes)
+                .sum::<u64>()
     }
 
     /// Returns the same as [`Self::bytes`], plus the bytes that are not written yet.
     #[must_use]
     pub fn expected_bytes(&self) -> u64 {
         let current = self.current.as_ref().map_or(0, FileWriter::expected_bytes);
-        current + self.complete_files.iter().map(|file| file.bytes).sum::<u64>()
+        current
+            + self
+                .complete_files
+                .iter()
+                .map(|file| file.bytes)
+                .sum::<u64>()
     }
 
     /// Returns the number of files begun so far.
@@ -402,7 +412,9 @@ impl Writer {
     }
 
     fn open_file(&mut self) -> Result<(), Error> {
-        let path = self.directory.join(self.file_name(self.complete_files.len()));
+        let path = self
+            .directory
+            .join(self.file_name(self.complete_files.len()));
         let begin = self.metadata_record();
         let file = FileWriter::create(&path, self.options.storage, &begin);
         match file {

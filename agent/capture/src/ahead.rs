@@ -78,7 +78,12 @@ impl Ahead {
     }
 
     /// Accepts the rest of a handed-over datagram.
-    pub fn add_remainder(&mut self, namespace: u32, rest: Reassembled, ready: impl FnMut(ReadyItem)) {
+    pub fn add_remainder(
+        &mut self,
+        namespace: u32,
+        rest: Reassembled,
+        ready: impl FnMut(ReadyItem),
+    ) {
         let Some(handover) = rest.handover else {
             return;
         };

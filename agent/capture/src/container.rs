@@ -29,12 +29,16 @@ const MOUNTS_PATH: &str = "/proc/self/mountinfo";
 /// Mounts of the first process, which is the host's unless the process ids are the container's own.
 pub const FIRST_MOUNTS: &str = "/proc/1/mountinfo";
 
-/// Returns whether this process is in a container of Docker, podman or Kubernetes. A mark alone is no
-/// evidence, as virtual machines are made of images too.
+/// Returns whether this process is in a container of Docker, podman or Kubernetes. A mark alone is
+/// no evidence, as virtual machines are made of images too.
 #[must_use]
 pub fn is_container() -> bool {
-    let engine = std::env::var(CONTAINER_VARIABLE).is_ok_and(|value| CONTAINER_ENGINES.contains(&value.as_str()));
-    let is_marked = engine || MARKER_FILES.into_iter().any(|path| Path::new(path).exists());
+    let engine = std::env::var(CONTAINER_VARIABLE)
+        .is_ok_and(|value| CONTAINER_ENGINES.contains(&value.as_str()));
+    let is_marked = engine
+        || MARKER_FILES
+            .into_iter()
+            .any(|path| Path::new(path).exists());
     is_marked && (has_own_processes() || has_own_root())
 }
 

@@ -314,7 +314,9 @@ impl LiveSource {
 
     /// Sets whether a client needs calls inside processes, if they are observed on demand.
     pub fn request_inside(&self, wanted: bool) {
-        self.inside.iter().for_each(|inside| inside.set_calls_requested(wanted));
+        self.inside
+            .iter()
+            .for_each(|inside| inside.set_calls_requested(wanted));
     }
 
     /// Sets which calls clients regard as late, and whether one requests their causes.
@@ -449,7 +451,8 @@ impl LiveSource {
     /// or the control group was removed.
     fn report_view(&mut self, held_up: bool, observer: &mut Observer) {
         let attached_anew = self.reattachments();
-        let is_new = std::mem::replace(&mut self.reported_reattachments, attached_anew) != attached_anew;
+        let is_new =
+            std::mem::replace(&mut self.reported_reattachments, attached_anew) != attached_anew;
         let sees_nothing = self.wires.is_empty()
             && self
                 .host

@@ -88,7 +88,8 @@ impl PieceAssembler {
 
     /// Keeps the buffer of a datagram that was read, for reuse.
     pub fn recycle(&mut self, mut buffer: Vec<u8>) {
-        if buffer.capacity() > PIECE_BYTES as usize && self.free_buffers.len() < FreshDatagrams::CAP {
+        if buffer.capacity() > PIECE_BYTES as usize && self.free_buffers.len() < FreshDatagrams::CAP
+        {
             buffer.clear();
             self.free_buffers.push(buffer);
         }

@@ -64,7 +64,11 @@ impl Sockets {
     /// Queries the kernel if a query is due, and passes changes to the model.
     pub fn follow(&mut self, filter: &Filter, now: u64, observer: &mut Observer) {
         let is_awaited = observer.awaits_holders();
-        let interval = if is_awaited { SHORT_SEARCH_INTERVAL } else { SEARCH_INTERVAL };
+        let interval = if is_awaited {
+            SHORT_SEARCH_INTERVAL
+        } else {
+            SEARCH_INTERVAL
+        };
         if now.saturating_sub(self.last_search) < interval {
             return;
         }

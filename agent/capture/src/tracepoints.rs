@@ -54,7 +54,11 @@ const LAYOUT_MEMBERS: [(Layout, &str, &str); Layout::COUNT] = [
         DROP_REASON_ENUM,
         "SKB_DROP_REASON_SOCKET_RCVBUFF",
     ),
-    (Layout::ReasonMemory, DROP_REASON_ENUM, "SKB_DROP_REASON_PROTO_MEM"),
+    (
+        Layout::ReasonMemory,
+        DROP_REASON_ENUM,
+        "SKB_DROP_REASON_PROTO_MEM",
+    ),
     (
         Layout::ReasonTimeout,
         DROP_REASON_ENUM,
@@ -65,7 +69,11 @@ const LAYOUT_MEMBERS: [(Layout, &str, &str); Layout::COUNT] = [
         DROP_REASON_ENUM,
         "SKB_DROP_REASON_FRAG_TOO_FAR",
     ),
-    (Layout::ReasonNone, DROP_REASON_ENUM, "SKB_DROP_REASON_NOT_SPECIFIED"),
+    (
+        Layout::ReasonNone,
+        DROP_REASON_ENUM,
+        "SKB_DROP_REASON_NOT_SPECIFIED",
+    ),
     (Layout::BufferDevice, "sk_buff", "dev"),
     (Layout::DeviceNamespace, "net_device", "nd_net"),
     (Layout::NamespaceFragments4, "net", "ipv4.fqdir"),

@@ -10,7 +10,7 @@ use anyhow::{Context as _, Result, bail};
 use ros2probe::discover::announcements::Announcements;
 use ros2probe::discover::participants::{FoundParticipant, Listening, listen};
 use ros2probe::discover::session::{MAX_PACKETS, Session, Target};
-use ros2probe::discover::{run_session, local_participant};
+use ros2probe::discover::{local_participant, run_session};
 use ros2probe_daemon::agent::configuration;
 
 use crate::cli::Discover;
@@ -30,11 +30,11 @@ pub(crate) fn discover(options: &Discover) -> Result<()> {
     };
     let participants = listen(config.capture, &listening)?;
     let seconds = options.listen;
-    let heard = match participants.len() {
+    let found = match participants.len() {
         1 => "1 participant".to_owned(),
         count => format!("{count} participants"),
     };
-    writeln!(out, "{heard} heard within {seconds} s; nothing was sent")?;
+    writeln!(out, "{found} heard within {seconds} s; nothing was sent")?;
     let mut targets = Vec::new();
     for participant in &participants {
         let described = describe(participant);
@@ -85,7 +85,12 @@ fn describe(participant: &FoundParticipant) -> String {
 }
 
 /// Sends requests to one participant. Returns whether every request was answered.
-fn request_announcements(target: &Target, domain_id: u32, options: &Discover, out: &mut impl Write) -> Result<bool> {
+fn request_announcements(
+    target: &Target,
+    domain_id: u32,
+    options: &Discover,
+    out: &mut impl Write,
+) -> Result<bool> {
     let (local_participant, socket) = local_participant(target, domain_id)?;
     let mut session = Session::new(local_participant, *target, !options.no_nodes);
     let will = if options.dry_run { "would" } else { "will" };

@@ -212,8 +212,8 @@ impl<'a> Frames<'a> {
     ) -> Result<Between, NoTransform> {
         let [up, down] = self.paths_to_ancestor(source, target)?;
         let stamp = common_stamp(&[&up, &down]);
-        let pose_of = |way: &[&TransformEdge<'_>]| {
-            way.iter().fold(IDENTITY, |pose, edge| {
+        let pose_of = |path: &[&TransformEdge<'_>]| {
+            path.iter().fold(IDENTITY, |pose, edge| {
                 let at_stamp = || history.pose_at(&edge.child, stamp_of(stamp));
                 let moving = (!edge.is_static).then(at_stamp).flatten();
                 let of_edge = moving.unwrap_or_else(|| Pose::of(edge));
@@ -237,9 +237,9 @@ impl<'a> Frames<'a> {
         target: &str,
         history: &History,
     ) -> Result<bool, NoTransform> {
-        let ways = self.paths_to_ancestor(source, target)?;
-        let stamp = stamp_of(common_stamp(&[&ways[0], &ways[1]]));
-        let mut moving = ways.iter().flatten().filter(|edge| !edge.is_static);
+        let paths = self.paths_to_ancestor(source, target)?;
+        let stamp = stamp_of(common_stamp(&[&paths[0], &paths[1]]));
+        let mut moving = paths.iter().flatten().filter(|edge| !edge.is_static);
         Ok(moving.all(|edge| history.pose_at(&edge.child, stamp).is_some()))
     }
 
@@ -257,8 +257,8 @@ impl<'a> Frames<'a> {
         let Some((common, _)) = common else {
             return Err(NoTransform::Apart(source.to_owned(), target.to_owned()));
         };
-        Ok([&from, &to].map(|way| {
-            let below = way.iter().take_while(|(frame, _)| frame != common);
+        Ok([&from, &to].map(|path| {
+            let below = path.iter().take_while(|(frame, _)| frame != common);
             below.filter_map(|(_, edge)| *edge).collect()
         }))
     }
@@ -357,8 +357,8 @@ impl<'a> Frames<'a> {
 }
 
 /// Returns the oldest of the last stamps of moving edges; zero without any.
-fn common_stamp(ways: &[&[&TransformEdge<'_>]]) -> (i32, u32) {
-    let moving = ways
+fn common_stamp(paths: &[&[&TransformEdge<'_>]]) -> (i32, u32) {
+    let moving = paths
         .iter()
         .copied()
         .flatten()

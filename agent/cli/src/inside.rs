@@ -139,7 +139,11 @@ pub fn text(inside: &Inside<'_>) -> String {
     table(&mut out, head, callbacks);
     for state in &inside.lifecycle_states {
         let node = state.node.as_deref().map_or(Cow::Borrowed("?"), Cow::from);
-        out.push_str(&format!("{} is {}\n", escaped(&node), escaped(&state.state)));
+        out.push_str(&format!(
+            "{} is {}\n",
+            escaped(&node),
+            escaped(&state.state)
+        ));
     }
     out
 }

@@ -98,7 +98,9 @@ fn write_worst_call(call: &LateCall<'_>, zone: &TimeZone, out: &mut String) {
     let _ = writeln!(out, "  [{}]", bar(&call.parts, total));
     let mut others: Vec<_> = call.others.iter().collect();
     others.sort_by(|one, other| other.seconds.total_cmp(&one.seconds));
-    let others = others.iter().filter(|other| other.seconds >= total * MIN_NAMED_SHARE);
+    let others = others
+        .iter()
+        .filter(|other| other.seconds >= total * MIN_NAMED_SHARE);
     let others: Vec<_> = others
         .take(4)
         .map(|other| match other.thread_id {
@@ -169,7 +171,9 @@ fn thread_in_words(other: &OtherThread<'_>, id: String) -> String {
 
 /// Returns the parts that are not small, with their lengths.
 fn part_list(parts: &[&Part<'_>], total: f64) -> String {
-    let shown = parts.iter().filter(|part| part.seconds >= total * MIN_NAMED_SHARE);
+    let shown = parts
+        .iter()
+        .filter(|part| part.seconds >= total * MIN_NAMED_SHARE);
     let words: Vec<_> = shown
         .map(|part| format!("{} {}", escaped(&part.cause), seconds(part.seconds)))
         .collect();
@@ -185,7 +189,8 @@ fn bar(parts: &[Part<'_>], total: f64) -> String {
         until += part.seconds;
         let letter = part.cause.chars().next().unwrap_or('?');
         #[expect(clippy::cast_precision_loss, reason = "a bar has few characters")]
-        while bar.len() < BAR_WIDTH && (bar.len() as f64 + 0.5) / BAR_WIDTH as f64 <= until / total {
+        while bar.len() < BAR_WIDTH && (bar.len() as f64 + 0.5) / BAR_WIDTH as f64 <= until / total
+        {
             bar.push(letter);
         }
     }

@@ -163,7 +163,9 @@ impl Components<'_> {
         let snapshots = match Snapshots::start(&config.recordings.snapshots, &recordings) {
             // A missing disk must not prevent observation.
             Err(refusal @ Refusal::NoDirectory)
-                if config.recordings.is_in_state_directory(&config.state_directory) =>
+                if config
+                    .recordings
+                    .is_in_state_directory(&config.state_directory) =>
             {
                 tracing::error!(%refusal, "snapshots are disabled");
                 Snapshots::default()
@@ -217,7 +219,9 @@ impl Components<'_> {
             stop: self.stop,
         };
         Ok(AssembledAgent {
-            run: run.with_state_writer(self.state_writer).with_history(history),
+            run: run
+                .with_state_writer(self.state_writer)
+                .with_history(history),
             context,
             reloads,
         })
@@ -299,7 +303,9 @@ pub fn run(options: Options) -> Result<()> {
         let inputs = remote_write::Inputs {
             metrics: Arc::new(sources.clone()),
             figures: Arc::clone(&sources.remote_write),
-            directory: state.directory().map(|state| state.path().join(REMOTE_WRITE_DIRECTORY)),
+            directory: state
+                .directory()
+                .map(|state| state.path().join(REMOTE_WRITE_DIRECTORY)),
         };
         let started = remote_write::start(settings, inputs, privilege::spawn_export);
         exporters.push(started.context("remote write cannot start")?);

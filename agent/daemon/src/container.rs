@@ -152,7 +152,10 @@ mod tests {
             "/proc/sys cannot be written, so a restart loses names and added watches: add --user 0:0"
         );
         assert_eq!(state_restriction(&StateChoice::Off), None);
-        assert_eq!(state_restriction(&StateChoice::At(PathBuf::from("/tmp"))), None);
+        assert_eq!(
+            state_restriction(&StateChoice::At(PathBuf::from("/tmp"))),
+            None
+        );
         let directory = tempfile::tempdir().unwrap();
         let writer = |mode| {
             fs::set_permissions(directory.path(), fs::Permissions::from_mode(mode)).unwrap();

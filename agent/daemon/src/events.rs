@@ -4,9 +4,9 @@
 //! references. Each reader keeps its own position; overwritten events are counted and reported to
 //! it.
 //!
-//! Bursts are limited: at most `MAX_EVENTS_PER_SECOND` events of one name are kept per second, and further ones are
-//! only counted. The seconds of robot events are those of the source's clock, so a capture yields
-//! the same events at any speed.
+//! Bursts are limited: at most `MAX_EVENTS_PER_SECOND` events of one name are kept per second, and
+//! further ones are only counted. The seconds of robot events are those of the source's clock, so a
+//! capture yields the same events at any speed.
 //!
 //! A number belongs to one run of the agent. An event id also names the run, so that a position
 //! from before a restart is not mistaken for a new one.

@@ -122,7 +122,8 @@ impl LimitFigures {
     #[must_use]
     pub fn facts(&self, state: &State) -> [LimitFacts; LIMIT_COUNT] {
         let rises = *self.rises.lock().unwrap_or_else(PoisonError::into_inner);
-        let is_recent = |at: Instant| state.agent.collected_at.saturating_duration_since(at) < REACHED_FOR;
+        let is_recent =
+            |at: Instant| state.agent.collected_at.saturating_duration_since(at) < REACHED_FOR;
         Limit::ALL.map(|limit| {
             let (used, reached) = self.usage(limit, state);
             let cap = self.caps.get(limit) as u64;

@@ -44,7 +44,11 @@ pub(crate) fn path(choice: &StateChoice) -> Option<PathBuf> {
         StateChoice::At(path) => Some(path.clone()),
         StateChoice::Auto => {
             let named = std::env::var_os(STATE_DIRECTORY_VARIABLE).filter(|path| !path.is_empty());
-            let default = || Path::new(DEFAULT_DIRECTORY).exists().then(|| DEFAULT_DIRECTORY.into());
+            let default = || {
+                Path::new(DEFAULT_DIRECTORY)
+                    .exists()
+                    .then(|| DEFAULT_DIRECTORY.into())
+            };
             named.map(PathBuf::from).or_else(default)
         }
     }

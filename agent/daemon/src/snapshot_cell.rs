@@ -445,7 +445,10 @@ mod tests {
         cell.publish_agent(at(3));
         assert!(futures_util::poll!(&mut publication).is_pending() && cell.is_requested());
         let own = cell.own_state();
-        assert_eq!((own.known().records, own.agent.collected_at), (7, at(3).collected_at));
+        assert_eq!(
+            (own.known().records, own.agent.collected_at),
+            (7, at(3).collected_at)
+        );
         assert!(!cell.was_snapshot_read(), "the snapshot was not read");
         assert_eq!(cell.state().known().records, 7);
         assert!(cell.was_snapshot_read() && !cell.was_snapshot_read());
@@ -484,7 +487,8 @@ mod tests {
     #[test]
     fn calls_are_wanted_until_ten_seconds_after_the_last_request() {
         let cell = SnapshotCell::new(SourceKind::Host);
-        let after = |seconds| cell.are_calls_requested(Instant::now() + Duration::from_secs(seconds));
+        let after =
+            |seconds| cell.are_calls_requested(Instant::now() + Duration::from_secs(seconds));
         assert!(!after(0));
         cell.request_calls();
         let rings = cell.bell().descriptor().unwrap();

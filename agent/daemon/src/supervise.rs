@@ -423,7 +423,10 @@ impl Watchdog {
         let now = Instant::now();
         let state = latest.own_state();
         let ready = state.ready(now);
-        for event in self.last_state.check(&ready, state.agent.reattachments, now) {
+        for event in self
+            .last_state
+            .check(&ready, state.agent.reattachments, now)
+        {
             events.record(event);
         }
         // A missing target does not stop the watchdog, since a restart cannot restore it.

@@ -154,7 +154,9 @@ impl Queue {
         };
         if self.begins_file() {
             let number = self.next;
-            let path = self.directory.join(format!("{number:010}.{FILE_EXTENSION}"));
+            let path = self
+                .directory
+                .join(format!("{number:010}.{FILE_EXTENSION}"));
             let mut blocks = Blocks::create(path, at)?;
             let appended = blocks.append_durably(&[block]);
             // The power may fail at any time: the file's name must be on disk, too.

@@ -46,8 +46,8 @@ pub struct Store {
     /// Maximum size of all files, in bytes.
     limit: u64,
     tiers: Mutex<[Vec<Blocks>; 2]>,
-    /// Unix time of the last [`Self::condense`]. Blocks that end later are those of a clock that was
-    /// set back.
+    /// Unix time of the last [`Self::condense`]. Blocks that end later are those of a clock that
+    /// was set back.
     now: AtomicU32,
 }
 
@@ -211,8 +211,8 @@ impl Store {
             self.visit(Tier::Seconds, Kind::Events, &times, &mut |block| {
                 events.push(block);
             });
-            // A block that ends later belongs to the next window, because the latest end is the time up
-            // to which rows are merged.
+            // A block that ends later belongs to the next window, because the latest end is the
+            // time up to which rows are merged.
             events.retain(|block| block.end <= times.end);
             blocks.extend(events);
             self.append(Tier::Tens, &blocks)?;

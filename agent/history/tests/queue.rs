@@ -126,7 +126,7 @@ fn a_damaged_record_is_skipped() {
 }
 
 #[test]
-fn a_directory_that_cannot_be_written_loses_nothing_of_the_queue() {
+fn an_unwritable_directory_loses_no_record_of_the_queue() {
     let place = tempfile::tempdir().unwrap();
     fs::write(place.path().join("file"), "").unwrap();
     let mut queue = Queue::open(&place.path().join("new"), LIMIT).unwrap();

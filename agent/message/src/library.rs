@@ -227,8 +227,8 @@ impl Library {
     }
 
     /// Returns the type of a name: with an announced RIHS01 hash, the first definition that matches
-    /// it; otherwise the first definition. With a hash of XTypes, only a type that nodes sent can be
-    /// compared: it is used if no file defines the type. Other hashes are ignored.
+    /// it; otherwise the first definition. With a hash of XTypes, only a type that nodes sent can
+    /// be compared: it is used if no file defines the type. Other hashes are ignored.
     pub fn find(
         &self,
         name: &str,
@@ -418,7 +418,7 @@ mod tests {
     }
 
     #[test]
-    fn parts_come_from_another_source_if_only_then_the_hash_matches() {
+    fn nested_types_are_read_from_another_source_if_the_hash_matches() {
         let workspace = prefix(&[("w/msg/W.msg", "a/B b\nstd_msgs/Header header")]);
         let below = prefix(&[("a/msg/B.msg", "int8 x")]);
         let nodes = prefix(&[("a/msg/B.msg", "int16 x")]);
@@ -617,7 +617,10 @@ mod tests {
         let deep = NotClosed::TooDeep;
         assert!(matches!(failure, NotFound::Refused { reason, .. } if reason == deep));
         let failure = library.find("a/msg/T20", Some(&announced)).unwrap_err();
-        assert!(matches!(failure, NotFound::OtherDefinition { .. }), "{failure}");
+        assert!(
+            matches!(failure, NotFound::OtherDefinition { .. }),
+            "{failure}"
+        );
         assert_eq!(
             library
                 .find("a/msg/T20", None)
@@ -642,7 +645,7 @@ mod tests {
     }
 
     #[test]
-    fn the_dialects_distribution_comes_first_then_the_others_newest_first() {
+    fn the_distribution_of_the_dialect_precedes_the_others_newest_first() {
         let here = tempfile::tempdir().unwrap();
         for name in ["humble", "iron", "jazzy", "rolling"] {
             fs::create_dir(here.path().join(name)).unwrap();

@@ -97,8 +97,8 @@ const TYPE_READERS: [(&str, Reader); 9] = [
     ("geometry_msgs/msg/PoseWithCovarianceStamped", stamped_pose),
 ];
 
-/// Returns the preview of a payload with its encapsulation header; `None` for a type without one. The
-/// type has a ROS name.
+/// Returns the preview of a payload with its encapsulation header; `None` for a type without one.
+/// The type has a ROS name.
 ///
 /// # Errors
 ///

@@ -1,5 +1,5 @@
-//! Types as nodes describe them: the response of `type_description_interfaces/srv/GetTypeDescription`
-//! (ROS 2 Iron and later, REP-2016).
+//! Types as nodes describe them: the response of
+//! `type_description_interfaces/srv/GetTypeDescription` (ROS 2 Iron and later, REP-2016).
 //!
 //! A response holds the fields of a type and of its nested types. With `include_type_sources` it
 //! also holds their files. The files are used if they define the described type, because they have
@@ -170,7 +170,8 @@ fn structure(description: &Message<'_>) -> Result<Structure, NotDescribed> {
 /// Returns the structure with these fields, of which the placeholder of rosidl is none.
 pub(crate) fn structure_of(name: TypeName, mut fields: Vec<Field>) -> Structure {
     if let [only] = &*fields
-        && (&*only.name, &only.element, only.shape) == (PLACEHOLDER_MEMBER, &Element::UInt8, Shape::Single)
+        && (&*only.name, &only.element, only.shape)
+            == (PLACEHOLDER_MEMBER, &Element::UInt8, Shape::Single)
     {
         fields.clear();
     }
@@ -188,7 +189,9 @@ fn field(description: &Message<'_>) -> Result<Field, NotDescribed> {
     let size = || capacity(number(described, "capacity")?);
     let (base, shape) = match id {
         _ if id > UNBOUNDED_OFFSET.into() => (id - u64::from(UNBOUNDED_OFFSET), Shape::Unbounded),
-        _ if id > BOUNDED_OFFSET.into() => (id - u64::from(BOUNDED_OFFSET), Shape::Bounded(size()?)),
+        _ if id > BOUNDED_OFFSET.into() => {
+            (id - u64::from(BOUNDED_OFFSET), Shape::Bounded(size()?))
+        }
         _ if id > ARRAY_OFFSET.into() => (id - u64::from(ARRAY_OFFSET), Shape::Array(size()?)),
         _ => (id, Shape::Single),
     };

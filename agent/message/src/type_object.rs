@@ -1,9 +1,9 @@
 //! Types as participants exchange them: TypeObjects, and the replies of the TypeLookup service that
 //! contain them (DDS-XTypes 1.3, 7.3.4 and 7.6.3.3).
 //!
-//! A TypeObject describes one type. It refers to others by their hash: the first 14 bytes of the MD5
-//! of their own TypeObject. A sender therefore cannot forge an object. Everything else in a reply is
-//! untrusted. Types that a `.msg` file cannot define are refused by name.
+//! A TypeObject describes one type. It refers to others by their hash: the first 14 bytes of the
+//! MD5 of their own TypeObject. A sender therefore cannot forge an object. Everything else in a
+//! reply is untrusted. Types that a `.msg` file cannot define are refused by name.
 
 mod assembly;
 
@@ -32,7 +32,8 @@ const REQUEST_IDENTITY: usize = 24;
 /// Discriminator of a TypeIdentifier or TypeObject of a minimal and of a complete type.
 const EK_MINIMAL: u8 = 0xf1;
 const EK_COMPLETE: u8 = 0xf2;
-/// `TypeLookup_getTypes_HashId`, and the identifier of the member `types`: from the MD5 of the names.
+/// `TypeLookup_getTypes_HashId`, and the identifier of the member `types`: from the MD5 of the
+/// names.
 const GET_TYPES: u32 = 0x0182_52d3;
 const TYPES: u32 = 0x0280_4ad1;
 /// Bits of a structure's flags.

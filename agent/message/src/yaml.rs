@@ -333,9 +333,9 @@ fn is_other_type(text: &str) -> bool {
         Regex::new(&format!("^(?:{float}|{other_float}|{integer}|{time})$")).ok()
     });
     match text.as_bytes().first() {
-        Some(b'0'..=b'9' | b'-' | b'+' | b'.') => {
-            OTHER_TYPE_PATTERN.as_ref().is_none_or(|regex| regex.is_match(text))
-        }
+        Some(b'0'..=b'9' | b'-' | b'+' | b'.') => OTHER_TYPE_PATTERN
+            .as_ref()
+            .is_none_or(|regex| regex.is_match(text)),
         Some(b'y' | b'Y' | b'n' | b'N' | b't' | b'T' | b'f' | b'F' | b'o' | b'O') => {
             let lower = text.to_ascii_lowercase();
             let word =

@@ -134,7 +134,10 @@ impl Definition {
     /// Sets the severity of events that report the end of a condition or an intended change.
     #[must_use]
     pub const fn resolved_severity(self, relief: Severity) -> Self {
-        Self { resolved_severity: relief, ..self }
+        Self {
+            resolved_severity: relief,
+            ..self
+        }
     }
 }
 

@@ -59,7 +59,8 @@ impl Format {
                     match parameter.split_once('=') {
                         Some(("q", value)) => weight = value.parse().unwrap_or(0.0),
                         Some(("version", version))
-                            if media == OPENMETRICS_TYPE && !["1.0.0", "0.0.1"].contains(&version) =>
+                            if media == OPENMETRICS_TYPE
+                                && !["1.0.0", "0.0.1"].contains(&version) =>
                         {
                             return None;
                         }

@@ -62,7 +62,11 @@ pub static FILES: [File; 44] = [
     File::new("stream.js", SCRIPT_TYPE, include_bytes!("../stream.js")),
     File::new("table.js", SCRIPT_TYPE, include_bytes!("../table.js")),
     File::new("timebar.js", SCRIPT_TYPE, include_bytes!("../timebar.js")),
-    File::new("transforms.js", SCRIPT_TYPE, include_bytes!("../transforms.js")),
+    File::new(
+        "transforms.js",
+        SCRIPT_TYPE,
+        include_bytes!("../transforms.js"),
+    ),
     File::new("ui.js", SCRIPT_TYPE, include_bytes!("../ui.js")),
     File::new(
         "vendor/hooks.mjs",
@@ -119,7 +123,11 @@ pub static FILES: [File; 44] = [
         SCRIPT_TYPE,
         include_bytes!("../views/inside.js"),
     ),
-    File::new("views/late.js", SCRIPT_TYPE, include_bytes!("../views/late.js")),
+    File::new(
+        "views/late.js",
+        SCRIPT_TYPE,
+        include_bytes!("../views/late.js"),
+    ),
     File::new(
         "views/nodes.js",
         SCRIPT_TYPE,

@@ -293,7 +293,7 @@ mod tests {
     }
 
     #[test]
-    fn triggered_bags_come_first_and_then_the_oldest_ones() {
+    fn triggered_bags_are_sorted_before_the_oldest_bags() {
         let directory = tempfile::tempdir().unwrap();
         let root = directory.path();
         for (name, trigger, seconds) in [

@@ -252,7 +252,9 @@ impl Shipper {
         if !self.is_permitted(bag) {
             return true;
         }
-        let is_due = self.last_scan.is_none_or(|scan| scan.elapsed() >= SCAN_INTERVAL);
+        let is_due = self
+            .last_scan
+            .is_none_or(|scan| scan.elapsed() >= SCAN_INTERVAL);
         if bag.is_triggered() || !is_due || self.scan().is_err() {
             return false;
         }
@@ -336,7 +338,11 @@ impl Shipper {
             .into_iter()
             .flatten();
         for entry in entries.flatten() {
-            if entry.file_name().to_string_lossy().starts_with(DELETED_PREFIX) {
+            if entry
+                .file_name()
+                .to_string_lossy()
+                .starts_with(DELETED_PREFIX)
+            {
                 let _ = fs::remove_dir_all(entry.path());
             }
         }

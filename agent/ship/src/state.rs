@@ -172,7 +172,9 @@ impl Records {
     }
 
     fn path(&self, bag: &str, ending: &str) -> PathBuf {
-        self.directory.join(BAGS_DIRECTORY).join(format!("{bag}.{ending}"))
+        self.directory
+            .join(BAGS_DIRECTORY)
+            .join(format!("{bag}.{ending}"))
     }
 }
 
@@ -278,7 +280,11 @@ mod tests {
     fn a_damaged_record_is_ignored_and_a_second_process_is_locked_out() {
         let root = tempfile::tempdir().unwrap();
         fs::create_dir(root.path().join(BAGS_DIRECTORY)).unwrap();
-        fs::write(root.path().join(BAGS_DIRECTORY).join("lap.json"), "{\"fingerp").unwrap();
+        fs::write(
+            root.path().join(BAGS_DIRECTORY).join("lap.json"),
+            "{\"fingerp",
+        )
+        .unwrap();
         let records = Records::open(root.path()).unwrap();
         assert_eq!(records.get("lap"), None);
         let second = Records::open(root.path()).unwrap_err();

@@ -107,7 +107,10 @@ mod tests {
         }
         let both = windows(&["22:00-06:00", "12:00-13:00"]);
         assert_eq!(both.time_to_opening(time(12, 30, 0, 0)), Duration::ZERO);
-        assert_eq!(both.time_to_opening(time(11, 59, 30, 0)), Duration::from_secs(30));
+        assert_eq!(
+            both.time_to_opening(time(11, 59, 30, 0)),
+            Duration::from_secs(30)
+        );
         assert_eq!(
             Windows::default().time_to_opening(time(3, 0, 0, 0)),
             Duration::ZERO
@@ -119,7 +122,7 @@ mod tests {
     }
 
     #[test]
-    fn other_texts_are_no_windows() {
+    fn invalid_windows_are_refused() {
         for text in [
             "",
             "22:00",

@@ -134,7 +134,9 @@ impl Kernel {
             self.ahead.record(0, record, |each| ready.push(each));
         }
         let mut records = Vec::new();
-        let rest_came = ready.iter().any(|each| matches!(each, ReadyItem::Remainder(_)));
+        let rest_came = ready
+            .iter()
+            .any(|each| matches!(each, ReadyItem::Remainder(_)));
         for each in ready {
             match each {
                 ReadyItem::Record(record) if rest_came => self.rest.push(record),

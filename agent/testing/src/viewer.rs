@@ -183,12 +183,12 @@ impl Viewer {
         let deadline = Instant::now() + PATIENCE;
         loop {
             let left = deadline.saturating_duration_since(Instant::now());
-            let news = self.next_within(left)?;
-            let news = news.with_context(|| format!("no {what}"))?;
-            if let Some(found) = wanted(self, &news) {
+            let server_message = self.next_within(left)?;
+            let server_message = server_message.with_context(|| format!("no {what}"))?;
+            if let Some(found) = wanted(self, &server_message) {
                 return Ok(found);
             }
-            if let ServerMessage::Closed(code, reason) = news {
+            if let ServerMessage::Closed(code, reason) = server_message {
                 bail!("closed with {code} ({reason}) before {what}");
             }
         }
@@ -269,7 +269,7 @@ impl Viewer {
 
     /// Waits until the server closes the connection. Returns code and reason.
     pub fn wait_for_close(&mut self) -> Result<(u16, String)> {
-        self.wait_for("close", |_, news| match news {
+        self.wait_for("close", |_, server_message| match server_message {
             ServerMessage::Closed(code, reason) => Some((*code, reason.clone())),
             _ => None,
         })

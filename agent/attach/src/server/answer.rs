@@ -111,7 +111,10 @@ fn used(process: u32, used: Use, sink: Sink<'_>) -> io::Result<()> {
 }
 
 fn activities(processes: &[u32], sink: Sink<'_>) -> io::Result<()> {
-    for part in processes.chunks(STATES_PER_PACKET).take(MAX_PROCESSES / STATES_PER_PACKET) {
+    for part in processes
+        .chunks(STATES_PER_PACKET)
+        .take(MAX_PROCESSES / STATES_PER_PACKET)
+    {
         let states = part.iter().filter_map(|process| activity(*process));
         sink(Answer::Activities(states.collect()), Vec::new())?;
     }

@@ -19,8 +19,8 @@ use super::super::bpf;
 use super::super::error_chain::Reason;
 use super::super::tracepoints::{KernelLayout, Tracepoints};
 use super::{
-    Deliveries, Filter, FilterError, FilterSettings, NO_DELIVERIES, UNUSED_MAP_ENTRIES, failed, load_program,
-    open, ring_size, take,
+    Deliveries, Filter, FilterError, FilterSettings, NO_DELIVERIES, UNUSED_MAP_ENTRIES, failed,
+    load_program, open, ring_size, take,
 };
 
 /// Attach types of linux/bpf.h.
@@ -235,16 +235,24 @@ impl Links {
     /// Fails as [`Filter::attach`] does.
     pub fn create(&self, cgroup: &File) -> Result<Vec<OwnedFd>, FilterError> {
         let zenoh = self.zenoh.iter();
-        let zenoh = zenoh.flat_map(|[one, other]| [(one, BPF_CGROUP_INET_INGRESS), (other, BPF_CGROUP_INET_EGRESS)]);
-        [(&self.ingress, BPF_CGROUP_INET_INGRESS), (&self.egress, BPF_CGROUP_INET_EGRESS)]
-            .into_iter()
-            .chain(zenoh)
-            .map(|(program, direction)| link(program, cgroup, direction))
-            .collect::<io::Result<_>>()
-            .map_err(|error| match error.raw_os_error() {
-                Some(libc::EPERM) => FilterError::attachment_refused(error),
-                _ => FilterError::Attach(error),
-            })
+        let zenoh = zenoh.flat_map(|[one, other]| {
+            [
+                (one, BPF_CGROUP_INET_INGRESS),
+                (other, BPF_CGROUP_INET_EGRESS),
+            ]
+        });
+        [
+            (&self.ingress, BPF_CGROUP_INET_INGRESS),
+            (&self.egress, BPF_CGROUP_INET_EGRESS),
+        ]
+        .into_iter()
+        .chain(zenoh)
+        .map(|(program, direction)| link(program, cgroup, direction))
+        .collect::<io::Result<_>>()
+        .map_err(|error| match error.raw_os_error() {
+            Some(libc::EPERM) => FilterError::attachment_refused(error),
+            _ => FilterError::Attach(error),
+        })
     }
 }
 

@@ -15,7 +15,8 @@ pub use ros2probe_attach::library::Form;
 use ros2probe_attach::request::Place;
 
 use super::{
-    Filter, FilterError, FilterSettings, NO_DELIVERIES, OBJECT, UNUSED_MAP_ENTRIES, open, ring_size, take,
+    Filter, FilterError, FilterSettings, NO_DELIVERIES, OBJECT, UNUSED_MAP_ENTRIES, open,
+    ring_size, take,
 };
 use crate::breakpoints::{Attached, Breakpoints, Means};
 use crate::uprobe::attachments::Refusal;

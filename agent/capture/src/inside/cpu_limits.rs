@@ -1,5 +1,5 @@
-//! Limits on the speed of CPUs, from `/sys`: a lower maximum frequency, cooling, and the firmware of
-//! Raspberry Pi.
+//! Limits on the speed of CPUs, from `/sys`: a lower maximum frequency, cooling, and the firmware
+//! of Raspberry Pi.
 //!
 //! The files are described in the kernel's documents on CPUFreq (`admin-guide/pm/cpufreq`) and on
 //! the thermal framework (`driver-api/thermal/sysfs-api`). Every user may read them.

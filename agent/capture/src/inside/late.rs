@@ -305,8 +305,8 @@ impl Learnt {
         });
     }
 
-    /// Returns bounds of duration and delay for the calls of the last minutes, in nanoseconds; `None`
-    /// before enough calls.
+    /// Returns bounds of duration and delay for the calls of the last minutes, in nanoseconds;
+    /// `None` before enough calls.
     fn bounds(&self) -> Option<[u64; 2]> {
         let [duration, delay] = &self.recent;
         let bound = |counts: &[f32; BUCKETS]| {
@@ -331,8 +331,8 @@ impl Learnt {
     }
 }
 
-/// Returns the upper end of the bucket with the 99th percentile, in nanoseconds; `None` if there are
-/// few values.
+/// Returns the upper end of the bucket with the 99th percentile, in nanoseconds; `None` if there
+/// are few values.
 fn p99(counts: &[f32; BUCKETS]) -> Option<u64> {
     let all: f32 = counts.iter().sum();
     if all < MIN_LEARNT_CALLS {
@@ -527,8 +527,8 @@ fn blocked(blocked: &late::Blocked, unit_of: UnitOf<'_>) -> Blocked {
     }
 }
 
-/// Returns whether the thread that ended a wait is known. An interrupt ends any other wait, whatever
-/// thread it interrupts.
+/// Returns whether the thread that ended a wait is known. An interrupt ends any other wait,
+/// whatever thread it interrupts.
 const fn has_waker(blocked: &late::Blocked) -> bool {
     matches!(blocked.kind as usize, wait::LOCK | wait::STOPPED) && blocked.waker != 0
 }

@@ -102,8 +102,8 @@ struct Work {
 
 impl Inside {
     /// Loads the programs, and attaches them to installed libraries. `cgroup` restricts them to
-    /// processes of this control group. `deliveries` are programs of the host hook, with its control
-    /// group.
+    /// processes of this control group. `deliveries` are programs of the host hook, with its
+    /// control group.
     ///
     /// # Errors
     /// Fails if a capability is missing, or if the kernel has no uprobes.

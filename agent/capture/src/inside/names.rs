@@ -113,30 +113,46 @@ impl Names {
                 ObjectKind::SubscriptionObject,
                 ObjectFact::Relation(ObjectKind::SubscriptionHandle, parent),
             ),
-            announced::SUBSCRIPTION_CALLBACK => {
-                (ObjectKind::Callback, ObjectFact::Relation(ObjectKind::SubscriptionObject, parent))
-            }
+            announced::SUBSCRIPTION_CALLBACK => (
+                ObjectKind::Callback,
+                ObjectFact::Relation(ObjectKind::SubscriptionObject, parent),
+            ),
             announced::TIMER => (
                 ObjectKind::Timer,
                 ObjectFact::Period(Duration::from_nanos(announcement.value)),
             ),
-            announced::TIMER_NODE => (ObjectKind::TimerNode, ObjectFact::Relation(ObjectKind::Node, parent)),
-            announced::TIMER_CALLBACK => (ObjectKind::Callback, ObjectFact::Relation(ObjectKind::Timer, parent)),
+            announced::TIMER_NODE => (
+                ObjectKind::TimerNode,
+                ObjectFact::Relation(ObjectKind::Node, parent),
+            ),
+            announced::TIMER_CALLBACK => (
+                ObjectKind::Callback,
+                ObjectFact::Relation(ObjectKind::Timer, parent),
+            ),
             announced::SERVICE => (ObjectKind::Service, endpoint()),
-            announced::SERVICE_CALLBACK => (ObjectKind::Callback, ObjectFact::Relation(ObjectKind::Service, parent)),
-            announced::STATE_MACHINE => (ObjectKind::StateMachine, ObjectFact::Relation(ObjectKind::Node, parent)),
+            announced::SERVICE_CALLBACK => (
+                ObjectKind::Callback,
+                ObjectFact::Relation(ObjectKind::Service, parent),
+            ),
+            announced::STATE_MACHINE => (
+                ObjectKind::StateMachine,
+                ObjectFact::Relation(ObjectKind::Node, parent),
+            ),
             announced::BUFFER => {
                 let capacity = u32::try_from(announcement.value).unwrap_or(u32::MAX);
                 (ObjectKind::Buffer, ObjectFact::Capacity(capacity))
             }
             announced::BUFFER_OWNER => {
-                self.known
-                    .insert((ObjectKind::Owner, parent), ObjectFact::Relation(ObjectKind::Owned, address));
+                self.known.insert(
+                    (ObjectKind::Owner, parent),
+                    ObjectFact::Relation(ObjectKind::Owned, address),
+                );
                 return None;
             }
-            announced::BUFFER_SUBSCRIPTION => {
-                (ObjectKind::Owned, ObjectFact::Relation(ObjectKind::SubscriptionObject, parent))
-            }
+            announced::BUFFER_SUBSCRIPTION => (
+                ObjectKind::Owned,
+                ObjectFact::Relation(ObjectKind::SubscriptionObject, parent),
+            ),
             _ => return None,
         };
         self.known.insert((of, address), named);

@@ -180,11 +180,15 @@ impl Observation {
             self.last_round = now;
             tracing::info!("observing calls: a client needs them");
         }
-        if self.suspended_at.is_some_and(|at| now - at >= SUSPENSION_TIME) {
+        if self
+            .suspended_at
+            .is_some_and(|at| now - at >= SUSPENSION_TIME)
+        {
             self.suspended_at = None;
             tracing::info!("attached again inside processes");
         }
-        // A late round is skipped, so the observation ends only when its last round can be reported.
+        // A late round is skipped, so the observation ends only when its last round can be
+        // reported.
         let ends = !shared.is_wanted() && !shared.is_late();
         let failed = self.find(now, !ends && self.suspended_at.is_none());
         if ends {

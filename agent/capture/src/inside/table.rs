@@ -172,12 +172,19 @@ impl ProcessTable {
             Some(Item::Late(call)) => {
                 self.late.push(*call);
             }
-            Some(Item::Announcement(announcement)) => self.apply_announcement(&announcement, clocks, broker),
+            Some(Item::Announcement(announcement)) => {
+                self.apply_announcement(&announcement, clocks, broker)
+            }
             None => {}
         }
     }
 
-    fn apply_announcement(&mut self, announcement: &Announcement, clocks: &Clocks, broker: &mut Broker) {
+    fn apply_announcement(
+        &mut self,
+        announcement: &Announcement,
+        clocks: &Clocks,
+        broker: &mut Broker,
+    ) {
         let observed = self.observe(announcement.process, broker);
         if announcement.kind == announced::TRANSITION {
             let transition = Transition {
@@ -258,8 +265,8 @@ impl ProcessTable {
     }
 
     /// Reads everything once. `elapsed`: time since the last round. `shows_intra_process`: whether
-    /// a process's library reports every step of messages within it. `delivery`: how the message of a
-    /// late call came into its process.
+    /// a process's library reports every step of messages within it. `delivery`: how the message of
+    /// a late call came into its process.
     pub fn round(
         &mut self,
         tables: &mut Tables,
@@ -398,7 +405,13 @@ impl ProcessTable {
     }
 
     /// Applies the budget of a process to its calls over this time. Returns its calls per second.
-    fn apply_budget(&mut self, tables: &mut Tables, id: u32, process: &Process, over: Duration) -> u64 {
+    fn apply_budget(
+        &mut self,
+        tables: &mut Tables,
+        id: u32,
+        process: &Process,
+        over: Duration,
+    ) -> u64 {
         let observed = self.known.entry(id).or_default();
         let milliseconds = u64::try_from(over.as_millis()).unwrap_or(u64::MAX).max(1);
         let hits = process.hits.saturating_sub(observed.hits);

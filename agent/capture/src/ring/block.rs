@@ -12,10 +12,12 @@ use ros2probe_wire::frame::PacketType;
 /// Offset of the word that holds a block's owner.
 pub(super) const STATUS_OFFSET: usize =
     offset_of!(tpacket_block_desc, hdr) + offset_of!(tpacket_hdr_v1, block_status);
-const COUNT_OFFSET: usize = offset_of!(tpacket_block_desc, hdr) + offset_of!(tpacket_hdr_v1, num_pkts);
+const COUNT_OFFSET: usize =
+    offset_of!(tpacket_block_desc, hdr) + offset_of!(tpacket_hdr_v1, num_pkts);
 const FIRST_OFFSET: usize =
     offset_of!(tpacket_block_desc, hdr) + offset_of!(tpacket_hdr_v1, offset_to_first_pkt);
-const LENGTH_OFFSET: usize = offset_of!(tpacket_block_desc, hdr) + offset_of!(tpacket_hdr_v1, blk_len);
+const LENGTH_OFFSET: usize =
+    offset_of!(tpacket_block_desc, hdr) + offset_of!(tpacket_hdr_v1, blk_len);
 
 const VLAN_TAG: usize =
     offset_of!(tpacket3_hdr, hv1) + offset_of!(tpacket_hdr_variant1, tp_vlan_tci);
@@ -23,7 +25,8 @@ const VLAN_TAG: usize =
 const ADDRESS_OFFSET: usize = size_of::<tpacket3_hdr>().next_multiple_of(libc::TPACKET_ALIGNMENT);
 
 // The kernel's ABI does not change; this pins the version of the offsets above.
-const _: () = assert!(STATUS_OFFSET == 8 && COUNT_OFFSET == 12 && FIRST_OFFSET == 16 && LENGTH_OFFSET == 20);
+const _: () =
+    assert!(STATUS_OFFSET == 8 && COUNT_OFFSET == 12 && FIRST_OFFSET == 16 && LENGTH_OFFSET == 20);
 const _: () = assert!(size_of::<tpacket_block_desc>() == 48 && size_of::<tpacket3_hdr>() == 48);
 const _: () = assert!(VLAN_TAG == 32 && ADDRESS_OFFSET == 48 && size_of::<sockaddr_ll>() == 20);
 const _: () = assert!(offset_of!(tpacket3_hdr, tp_mac) == 24);
@@ -175,7 +178,11 @@ pub(super) mod tests {
     pub(in crate::ring) fn block_of(frames: &[&[u8]]) -> Vec<u8> {
         let mut block = vec![0; 48];
         put(&mut block, STATUS_OFFSET, libc::TP_STATUS_USER);
-        put(&mut block, COUNT_OFFSET, u32::try_from(frames.len()).unwrap());
+        put(
+            &mut block,
+            COUNT_OFFSET,
+            u32::try_from(frames.len()).unwrap(),
+        );
         put(&mut block, FIRST_OFFSET, 48);
         for (number, bytes) in (1_u32..).zip(frames) {
             let last = number == u32::try_from(frames.len()).unwrap();

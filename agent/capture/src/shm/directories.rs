@@ -182,7 +182,8 @@ impl ShmDirectories {
     /// rounds.
     pub fn find_new(&mut self) {
         self.newest.look();
-        if self.newest.must_list || self.is_mounting || matches!(self.scope, Scope::Directories(_)) {
+        if self.newest.must_list || self.is_mounting || matches!(self.scope, Scope::Directories(_))
+        {
             self.inspect_scope();
         }
     }
@@ -249,7 +250,8 @@ impl ShmDirectories {
         for &pid in processes {
             let (known, met) = before.get(&pid).copied().unwrap_or((None, 0));
             self.is_mounting |= met <= MOUNTING_ROUNDS;
-            let is_settled = met > MOUNTING_ROUNDS && met % MAX_QUIET_ROUNDS != pid % MAX_QUIET_ROUNDS;
+            let is_settled =
+                met > MOUNTING_ROUNDS && met % MAX_QUIET_ROUNDS != pid % MAX_QUIET_ROUNDS;
             let directory = match known.and_then(|id| self.directories.get_mut(&id)) {
                 // The path of the directory may lead through another process, which may have ended.
                 Some(directory) if is_settled && (directory.seen || directory.path.exists()) => {
@@ -308,7 +310,8 @@ impl ShmDirectory {
     fn list(&mut self, left_out: &mut u64) -> bool {
         let changed = fs::metadata(&self.path).and_then(|metadata| metadata.modified());
         let changed = changed.ok();
-        let settled = changed.is_some_and(|at| at.elapsed().is_ok_and(|age| age > TIMESTAMP_GRANULARITY));
+        let settled =
+            changed.is_some_and(|at| at.elapsed().is_ok_and(|age| age > TIMESTAMP_GRANULARITY));
         if settled && changed == self.changed {
             return false;
         }
@@ -345,7 +348,11 @@ impl ShmDirectory {
 
     /// For a partially listed directory, returns the `listed` files and the `known` files that
     /// still exist.
-    fn keep_existing(&self, listed: Vec<(Name, u64)>, known: HashMap<Name, u64>) -> Vec<(Name, u64)> {
+    fn keep_existing(
+        &self,
+        listed: Vec<(Name, u64)>,
+        known: HashMap<Name, u64>,
+    ) -> Vec<(Name, u64)> {
         let mut files: HashMap<Name, u64> = listed.into_iter().collect();
         for (name, inode) in known {
             let metadata = || fs::symlink_metadata(self.path.join(name.file_name()));
@@ -430,7 +437,8 @@ impl NewestProcess {
             self.rounds.saturating_add(1)
         };
         self.rounds_since_list += 1;
-        self.must_list = self.rounds <= MOVING_ROUNDS || self.rounds_since_list >= MAX_REUSED_ROUNDS;
+        self.must_list =
+            self.rounds <= MOVING_ROUNDS || self.rounds_since_list >= MAX_REUSED_ROUNDS;
         if self.must_list {
             self.rounds_since_list = 0;
         }

@@ -14,13 +14,13 @@ use ros2probe_wire::DomainId;
 /// Size of the blocks that a file's metadata counts, in bytes.
 const FILE_BLOCK_BYTES: u64 = 512;
 
-/// Inode of a network namespace, and a domain. Participants of Fast DDS that have both in common use
-/// shared memory with each other.
+/// Inode of a network namespace, and a domain. Participants of Fast DDS that have both in common
+/// use shared memory with each other.
 type SharingGroup = (u64, u32);
 
 impl ShmDirectories {
-    /// Returns the use of the directories. Network namespaces of processes that this process may not
-    /// inspect are unknown.
+    /// Returns the use of the directories. Network namespaces of processes that this process may
+    /// not inspect are unknown.
     #[must_use]
     pub fn memory_use(&self) -> MemoryUse {
         let locks = Locks::read();

@@ -41,7 +41,9 @@ use self::tap::{Counters, Tap};
 use super::border::observe;
 use super::container::{is_container, is_service};
 use super::reorder_buffer::ReorderBuffer;
-use super::system::{Clocks, DirectoryWatch, wall_clock_nanoseconds, monotonic, run_first, thread_cpu, wait};
+use super::system::{
+    Clocks, DirectoryWatch, monotonic, run_first, thread_cpu, wait, wall_clock_nanoseconds,
+};
 use crate::threads::{Progress, Spawn, Task};
 use ros2probe_model::observe::input::Input;
 use ros2probe_model::observe::observer::{Observer, Wanted};
@@ -343,7 +345,9 @@ fn poll(
             && tap
                 .directories()
                 .all(|(id, path)| watched.get(&id).is_some_and(|known| known == path));
-        let idle = tap.until_next_search(now).filter(|_| is_same && watches_all);
+        let idle = tap
+            .until_next_search(now)
+            .filter(|_| is_same && watches_all);
         if !is_same {
             // A file may have appeared just before: the next listing follows soon.
             let paths = tap.directories();

@@ -36,8 +36,8 @@ const ANNOUNCEMENT_WATCH: f64 = 0.1;
 /// while topics are measured, a minute in which a robot starts costs less than 2.5 % of a CPU.
 const MAX_CREDIT: f64 = 0.4;
 const CREDIT_PER_SECOND: f64 = 0.002;
-/// Maximum sleep while every message is needed and CPU time is saved for it. In a burst, a sender reuses its buffers after some
-/// 100 us, and its readers are faster than that.
+/// Maximum sleep while every message is needed and CPU time is saved for it. In a burst, a sender
+/// reuses its buffers after some 100 us, and its readers are faster than that.
 const EVERY_MESSAGE_SLEEP: f64 = 50e-6;
 const EARLY_WAKE: f64 = 20e-6;
 /// Maximum CPU time that is saved for polls while every message is needed, so that a short

@@ -256,13 +256,15 @@ impl Tap {
         }
     }
 
-    /// Polls the ports that are due, up to a limit of messages, at `now` nanoseconds of the monotonic
-    /// clock; appends items of interest. Returns the number of announced messages.
+    /// Polls the ports that are due, up to a limit of messages, at `now` nanoseconds of the
+    /// monotonic clock; appends items of interest. Returns the number of announced messages.
     pub fn poll(&mut self, now: u64, found: &mut Vec<Item>) -> usize {
         self.now = now;
         self.classifier.refill(now);
-        let lists = now.saturating_sub(self.last_listing) >= LIST_INTERVAL || self.last_listing == 0;
-        let tries = !self.uninitialized.is_empty() && now.saturating_sub(self.last_open_attempt) >= OPEN_RETRY_INTERVAL;
+        let lists =
+            now.saturating_sub(self.last_listing) >= LIST_INTERVAL || self.last_listing == 0;
+        let tries = !self.uninitialized.is_empty()
+            && now.saturating_sub(self.last_open_attempt) >= OPEN_RETRY_INTERVAL;
         if (lists || tries) && self.may_list(now) {
             let before = thread_cpu();
             if lists {
@@ -440,7 +442,9 @@ impl Tap {
     fn open_segment(&mut self, key: SegmentKey, now: u64) {
         match self.segments.get(&key) {
             Some(Segment::Open(..)) => return,
-            Some(Segment::Missing(since)) if now.saturating_sub(*since) < RETRY_NANOSECONDS => return,
+            Some(Segment::Missing(since)) if now.saturating_sub(*since) < RETRY_NANOSECONDS => {
+                return;
+            }
             _ => {}
         }
         if self.segments.is_full() && !self.segments.contains_key(&key) {
@@ -477,7 +481,9 @@ impl Tap {
                 self.directories.find();
             }
             self.abandoned.clear();
-            if now.saturating_sub(self.last_memory_use) >= MEMORY_USE_INTERVAL || self.last_memory_use == 0 {
+            if now.saturating_sub(self.last_memory_use) >= MEMORY_USE_INTERVAL
+                || self.last_memory_use == 0
+            {
                 self.last_memory_use = now;
                 self.counters.memory_use = self.directories.memory_use();
             }

@@ -7,7 +7,7 @@ use ros2probe_wire::frame::{Packet, Segment};
 use ros2probe_wire::host::{Piece, chunk};
 use ros2probe_wire::record::flag;
 
-use super::{MissingBefore, Chunk, Protocol};
+use super::{Chunk, MissingBefore, Protocol};
 
 /// Returns the direction to which a segment belongs.
 #[must_use]

@@ -49,7 +49,9 @@ impl Search {
                 false => Assessment::Other,
             };
             return self.after_search(match looks {
-                Assessment::Zenoh(_) | Assessment::Rtps(_) | Assessment::Undecided if !is_whole => Assessment::Other,
+                Assessment::Zenoh(_) | Assessment::Rtps(_) | Assessment::Undecided if !is_whole => {
+                    Assessment::Other
+                }
                 looks => looks,
             });
         }

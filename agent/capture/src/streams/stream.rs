@@ -9,7 +9,7 @@ use ros2probe_wire::rtps_tcp::{self, FrameHeader};
 use ros2probe_wire::{GuidPrefix, Timestamp};
 
 use super::search::{self, Assessment, Search};
-use super::{MissingBefore, Chunk, Counters, Protocol};
+use super::{Chunk, Counters, MissingBefore, Protocol};
 use crate::tables::{SegmentsAhead, SegmentsAheadBytes};
 
 /// Maximum distance of a segment from the next expected byte: the largest TCP window.
@@ -114,8 +114,8 @@ pub struct Stream {
     ahead_bytes: Sum<SegmentsAheadBytes>,
     /// When the first segment began to wait.
     waiting_since: Timestamp,
-    /// The protocol whose batches or frames were read in the stream. TLS on a port of Zenoh counts as
-    /// Zenoh.
+    /// The protocol whose batches or frames were read in the stream. TLS on a port of Zenoh counts
+    /// as Zenoh.
     protocol: Option<Protocol>,
     is_zenoh_port: bool,
 }
@@ -159,8 +159,8 @@ impl Stream {
         partial + self.ahead_bytes.used()
     }
 
-    /// Drops most of the held bytes of an unfinished batch or frame. Its boundary stays known, so only
-    /// its payload is not read. Returns whether many bytes were dropped.
+    /// Drops most of the held bytes of an unfinished batch or frame. Its boundary stays known, so
+    /// only its payload is not read. Returns whether many bytes were dropped.
     pub fn shorten(&mut self) -> bool {
         match &mut self.position {
             Position::Batch(partial) if partial.captured.capacity() > MIN_SHORTENED_BYTES => {
@@ -402,7 +402,9 @@ impl Stream {
                     return TakeResult::Chunk;
                 }
                 counters.unsynchronized_bytes += length as u64;
-                if let Assessment::Zenoh(held) = search.add(bytes, length, false, self.is_zenoh_port) {
+                if let Assessment::Zenoh(held) =
+                    search.add(bytes, length, false, self.is_zenoh_port)
+                {
                     let held_bytes = held.len();
                     counters.unsynchronized_bytes = counters
                         .unsynchronized_bytes
@@ -415,7 +417,8 @@ impl Stream {
         }
     }
 
-    /// Reads `length` bytes, of which the first ones were captured. They begin with a batch or frame.
+    /// Reads `length` bytes, of which the first ones were captured. They begin with a batch or
+    /// frame.
     fn read_found(
         &mut self,
         protocol: Protocol,
@@ -500,7 +503,12 @@ impl Partial {
     }
 
     /// Reports a complete batch or frame of `total` bytes.
-    fn report_batch(&mut self, total: usize, counters: &mut Counters, report: &mut impl FnMut(Event<'_>)) {
+    fn report_batch(
+        &mut self,
+        total: usize,
+        counters: &mut Counters,
+        report: &mut impl FnMut(Event<'_>),
+    ) {
         let length = total - self.prefix_len();
         let bytes = self.captured.get(self.prefix_len()..).unwrap_or_default();
         match self.protocol {
@@ -513,8 +521,8 @@ impl Partial {
             }
             Protocol::Rtps => {
                 counters.frames += 1;
-                // The header of a message has magic, version and vendor before the prefix (RTPS 2.5,
-                // 9.4.4). A control message has none.
+                // The header of a message has magic, version and vendor before the prefix (RTPS
+                // 2.5, 9.4.4). A control message has none.
                 let is_message = bytes.starts_with(b"RTPS");
                 let header = self.captured.first_chunk();
                 let header = header.and_then(|header| FrameHeader::read(*header));

@@ -77,7 +77,10 @@ fn required_capabilities() -> [(CapabilitySet, &'static str); 2] {
 /// mapped file that was replaced, or that only its user may read.
 #[must_use]
 pub fn usable_capabilities() -> CapabilitySet {
-    let required: CapabilitySet = required_capabilities().iter().map(|(one, _)| *one).collect();
+    let required: CapabilitySet = required_capabilities()
+        .iter()
+        .map(|(one, _)| *one)
+        .collect();
     required | CapabilitySet::CHECKPOINT_RESTORE | CapabilitySet::DAC_READ_SEARCH
 }
 
@@ -123,9 +126,9 @@ pub struct Uprobe {
 
 impl Uprobe {
     /// Loads the programs, and attaches them to installed libraries. With `on_demand`, they are
-    /// detached while no process starts and [`Self::set_demand`] does not need them. `cgroup` restricts
-    /// them to processes of this control group. `broker` is the socket of the process that attaches
-    /// them.
+    /// detached while no process starts and [`Self::set_demand`] does not need them. `cgroup`
+    /// restricts them to processes of this control group. `broker` is the socket of the process
+    /// that attaches them.
     ///
     /// # Errors
     /// Fails if the programs may not be loaded, or if the kernel has no uprobes.

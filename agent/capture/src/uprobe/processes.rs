@@ -214,8 +214,8 @@ impl Processes {
     }
 }
 
-/// Returns the holder of the lock in a line of [`LOCKS_PATH`], if Fast DDS takes this kind for its ports
-/// and segments.
+/// Returns the holder of the lock in a line of [`LOCKS_PATH`], if Fast DDS takes this kind for its
+/// ports and segments.
 fn holder(line: &str) -> Option<u32> {
     let mut fields = line.split_ascii_whitespace().skip(1);
     // An arrow precedes a lock that a process waits for.

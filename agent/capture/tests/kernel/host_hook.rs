@@ -329,7 +329,7 @@ fn two_sockets_in_a_multicast_group_yield_two_records_or_one_capture() -> Result
 }
 
 #[test]
-fn a_full_ring_loses_captures_and_nothing_else() -> Result<()> {
+fn a_full_ring_loses_only_captures() -> Result<()> {
     let host = Namespace::isolated()?;
     let mut observed = Observed::new(Verdict::Capture)?;
     let sender = observed.socket(&host, "127.0.0.1:0")?;
@@ -352,7 +352,7 @@ fn a_full_ring_loses_captures_and_nothing_else() -> Result<()> {
 }
 
 #[test]
-fn a_socket_in_use_stays_known_while_more_sockets_than_the_cap_come_and_go() -> Result<()> {
+fn a_socket_in_use_is_never_evicted_by_sockets_beyond_the_cap() -> Result<()> {
     const BURST_LEN: usize = 500;
     use ros2probe_wire::time::SECOND;
     let cpus = std::thread::available_parallelism()?.get();
@@ -392,7 +392,11 @@ fn a_socket_in_use_stays_known_while_more_sockets_than_the_cap_come_and_go() -> 
     arrives(&mut observed, 0, &used)?;
     assert_eq!(forgotten(&observed), 0);
     while met < 2 * SOCKET_CAPACITY as usize {
-        let make = || (0..BURST_LEN).map(|_| bind()).collect::<io::Result<Vec<_>>>();
+        let make = || {
+            (0..BURST_LEN)
+                .map(|_| bind())
+                .collect::<io::Result<Vec<_>>>()
+        };
         let others = observed.make(&host, make)??;
         for other in &others {
             arrives(&mut observed, 1, other)?;

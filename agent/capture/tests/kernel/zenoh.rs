@@ -16,7 +16,7 @@ use ros2probe_capture::netns;
 use ros2probe_capture::pcap::PcapReader;
 use ros2probe_capture::reassembly::Limits;
 use ros2probe_capture::sockets::Sockets;
-use ros2probe_capture::streams::{MissingBefore, Chunk, Protocol, Streamed, Streams, flow};
+use ros2probe_capture::streams::{Chunk, MissingBefore, Protocol, Streamed, Streams, flow};
 use ros2probe_capture::system::Clocks;
 use ros2probe_capture::wire_tap::{WireTap, WireTapSettings};
 use ros2probe_model::facts::route::Destination;

@@ -1,6 +1,7 @@
 //! `make fleet`: three robots in network namespaces of their own, and a centre with Prometheus,
 //! Alertmanager and VictoriaMetrics. Each robot's agent delivers by remote write. The second robot
-//! loses messages between its two computers. The third one is out of reach for a minute of each two.
+//! loses messages between its two computers. The third one is out of reach for a minute of each
+//! two.
 //!
 //! The engines and the page of each robot are relayed to ports of this machine. The summary is the
 //! output of `rp fleet`.

@@ -22,7 +22,7 @@ use ros2probe_metrics::export_thread::ExportThread;
 use ros2probe_metrics::metric_sink::MetricSink;
 use ros2probe_metrics::metric_source::MetricSource;
 use ros2probe_metrics::otlp::Host;
-use ros2probe_metrics::remote_write::{self, SampleFate, RemoteWriteSettings, Request};
+use ros2probe_metrics::remote_write::{self, RemoteWriteSettings, Request, SampleFate};
 use ros2probe_model::report::snapshot::Snapshot;
 use ros2probe_testing::{ports, sample_robot};
 

@@ -42,7 +42,11 @@ pub(crate) async fn send_all(
 }
 
 /// Receives the messages of [`send_all`].
-pub(crate) async fn receive_all(context: &Context, topics: usize, stop: &Arc<AtomicBool>) -> Result<()> {
+pub(crate) async fn receive_all(
+    context: &Context,
+    topics: usize,
+    stop: &Arc<AtomicBool>,
+) -> Result<()> {
     let qos = reliable(DEPTH);
     for first in (0..topics).step_by(TOPICS_OF_A_NODE) {
         let mut node = node(context, &format!("/listener{first}"), bare())?;

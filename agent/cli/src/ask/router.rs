@@ -8,7 +8,7 @@ use anyhow::{Result, bail};
 use ros2probe::discover::zenoh::address::RouterAddress;
 use ros2probe::discover::zenoh::graph::{DomainGraph, EndpointKind};
 use ros2probe::discover::zenoh::session::Step;
-use ros2probe::discover::zenoh::{Answer, connect, run_conversation, plan};
+use ros2probe::discover::zenoh::{Answer, connect, plan, run_conversation};
 use ros2probe_daemon::agent::configuration;
 use ros2probe_daemon::privilege::{Role, drop_capabilities};
 
@@ -125,7 +125,8 @@ fn report(answer: &Answer, out: &mut impl Write) -> Result<()> {
 
 fn counts_text(graph: &DomainGraph) -> String {
     let nodes = number(graph.nodes.len(), "node", "nodes");
-    let endpoints = ENDPOINT_KINDS.map(|(kind, one, several)| number(graph.count(kind), one, several));
+    let endpoints =
+        ENDPOINT_KINDS.map(|(kind, one, several)| number(graph.count(kind), one, several));
     let (others, last) = endpoints.split_at(endpoints.len() - 1);
     format!("{nodes}, {} and {}", others.join(", "), last.concat())
 }
@@ -150,7 +151,8 @@ mod tests {
         ] {
             assert_eq!(outside_cgroup_note(observed, inside), None, "{inside}");
         }
-        let note = outside_cgroup_note(observed, "0::/user.slice/user-0.slice/session-1.scope\n").unwrap();
+        let note =
+            outside_cgroup_note(observed, "0::/user.slice/user-0.slice/session-1.scope\n").unwrap();
         assert!(
             note.contains("/sys/fs/cgroup/robot.slice (capture.cgroup)"),
             "{note}"

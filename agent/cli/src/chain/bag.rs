@@ -217,7 +217,7 @@ mod tests {
     }
 
     #[test]
-    fn messages_that_begin_with_a_header_are_stamped_whatever_their_type() {
+    fn messages_of_any_type_that_begin_with_a_header_are_stamped() {
         let message = |type_name, definition| Message {
             topic: "/a",
             type_name,

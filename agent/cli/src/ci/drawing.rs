@@ -120,7 +120,10 @@ pub(super) fn graph(seen: &Observation, marked: &BTreeSet<&str>) -> (String, usi
         let topic = topics.get(&*edge.topic);
         let (ends, from) = match edge.is_publisher {
             true => (publishers.get(&*edge.node).zip(topic), COLUMN_WIDTH),
-            false => (topic.zip(subscribers.get(&*edge.node)), 2.0 * COLUMN_WIDTH + COLUMN_GAP),
+            false => (
+                topic.zip(subscribers.get(&*edge.node)),
+                2.0 * COLUMN_WIDTH + COLUMN_GAP,
+            ),
         };
         let Some((begin, end)) = ends else { continue };
         let (middle, to) = (from + COLUMN_GAP / 2.0, from + COLUMN_GAP);

@@ -414,7 +414,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_that_nothing_observed_fails() {
+    fn an_unobserved_run_fails() {
         let empty = Observation::new(RULES, 0);
         let conditions = judge(&run(20.0), &empty);
         assert_eq!(failed(&conditions), [("observation", "participants")]);

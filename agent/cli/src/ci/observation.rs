@@ -201,10 +201,9 @@ impl Observation {
             let left_out = self.omitted;
             missed.push(format!("{left_out} names are left out: the report is full"));
         }
-        let unseen = self
-            .findings
-            .values()
-            .filter(|found| UNSEEN_FINDINGS.contains(&&*found.kind) && found.seconds.judged(until) > 0);
+        let unseen = self.findings.values().filter(|found| {
+            UNSEEN_FINDINGS.contains(&&*found.kind) && found.seconds.judged(until) > 0
+        });
         missed.extend(unseen.map(|found| found.text.clone()));
         missed
     }
@@ -291,7 +290,9 @@ impl Observation {
         self.participants = self.participants.max(participants.len());
         self.present.participants = participants;
         let topics = graph.topics.iter().filter(|topic| here(topic.1));
-        let names = topics.clone().map(|topic| (topic.0, display_name(&topic.2)));
+        let names = topics
+            .clone()
+            .map(|topic| (topic.0, display_name(&topic.2)));
         self.present.topics = names.collect();
         self.present
             .rows
@@ -313,7 +314,8 @@ impl Observation {
 
     fn set_edges(&mut self, graph: &Graph<'_>) {
         let nodes = graph.nodes.iter().filter(|node| node.1 == self.domain_id);
-        let nodes: HashMap<u32, String> = nodes.map(|node| (node.0, display_name(&node.2))).collect();
+        let nodes: HashMap<u32, String> =
+            nodes.map(|node| (node.0, display_name(&node.2))).collect();
         let processes = graph.participants.iter().map(|each| {
             let process = each.6.as_deref().unwrap_or("a process");
             let id = each.5.map_or_else(String::new, |id| format!(" {id}"));

@@ -291,7 +291,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_report_escapes_names_and_refers_to_nothing_outside() {
+    fn a_report_escapes_names_and_has_no_external_reference() {
         let mut seen = Observation::new(RULES, 0);
         seen.line(graph(1, &["/a'\"><img src=x onerror=alert(1)>", "/b"]), 0.0);
         for second in 1..=20_u8 {

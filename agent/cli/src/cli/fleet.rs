@@ -53,9 +53,14 @@ const EXIT_TROUBLE: u8 = 3;
 
 impl Fleet {
     pub(crate) fn print(self) -> Result<ExitCode> {
-        let named = || std::env::var(ENGINE_VARIABLE).ok().filter(|url| !url.is_empty());
+        let named = || {
+            std::env::var(ENGINE_VARIABLE)
+                .ok()
+                .filter(|url| !url.is_empty())
+        };
         let Some(url) = self.engine.or_else(named) else {
-            let text = format!("rp: no engine is named: pass --engine URL, or set {ENGINE_VARIABLE}");
+            let text =
+                format!("rp: no engine is named: pass --engine URL, or set {ENGINE_VARIABLE}");
             return Err(UserError(text).into());
         };
         let token = self.token_file.map(|path| {

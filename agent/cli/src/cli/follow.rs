@@ -261,7 +261,9 @@ impl<'a> Types<'a> {
         match self.writers.get(&sample.writer) {
             Some(Ok(known)) => return Some(Arc::clone(known)),
             // A node may describe the type to the agent at any time.
-            Some(Err(at)) if self.agent.is_none() || at.elapsed() < DEFINITION_RETRY_INTERVAL => return None,
+            Some(Err(at)) if self.agent.is_none() || at.elapsed() < DEFINITION_RETRY_INTERVAL => {
+                return None;
+            }
             _ => {}
         }
         let offered = sample.offered.as_ref();

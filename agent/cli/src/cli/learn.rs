@@ -141,7 +141,7 @@ impl Session {
         let end = begin + Duration::from_secs(self.seconds.into());
         let mut due = begin + VIEW_INTERVAL;
         let mut is_explained = false;
-        while !self.is_over(Instant::now() >= end) {
+        while !self.is_finished(Instant::now() >= end) {
             let left = due.saturating_duration_since(Instant::now());
             if left.is_zero() {
                 self.view_until_end(&mut lines, agent)?;
@@ -177,7 +177,7 @@ impl Session {
             return Ok(());
         };
         let mut next = begin.floor() + 1.0;
-        while !self.is_over(self.learner.seconds() >= self.seconds) {
+        while !self.is_finished(self.learner.seconds() >= self.seconds) {
             let time: Result<CaptureTime, _> = format!("{next:.0}").parse();
             let Ok(time) = time else { break };
             if !agent.advance(time) {
@@ -189,7 +189,7 @@ impl Session {
         Ok(())
     }
 
-    fn is_over(&self, is_complete: bool) -> bool {
+    fn is_finished(&self, is_complete: bool) -> bool {
         is_complete || self.stop.load(Ordering::Relaxed)
     }
 

@@ -262,7 +262,9 @@ impl<'a> Notes<'a> {
 
 impl Missing {
     fn all() -> MutexGuard<'static, Self> {
-        MISSING_MESSAGES.lock().unwrap_or_else(PoisonError::into_inner)
+        MISSING_MESSAGES
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
     }
 
     fn add(&mut self, key: (String, &'static str), samples: u64) {
@@ -375,7 +377,11 @@ fn counted_inside(topic: &Topic<'_>) -> Option<String> {
 }
 
 fn shortened_list(names: &[String]) -> String {
-    let shown: Vec<&str> = names.iter().take(MAX_NAMED_TOPICS).map(String::as_str).collect();
+    let shown: Vec<&str> = names
+        .iter()
+        .take(MAX_NAMED_TOPICS)
+        .map(String::as_str)
+        .collect();
     let shown = shown.join(", ");
     match names.len().saturating_sub(MAX_NAMED_TOPICS) {
         0 => shown,

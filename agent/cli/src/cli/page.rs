@@ -100,7 +100,8 @@ fn open(address: &str) -> Result<()> {
     match opened {
         Ok(status) if status.success() => Ok(()),
         _ => {
-            let reason = format!("{BROWSER_OPENER} does not open it: copy the address into a browser");
+            let reason =
+                format!("{BROWSER_OPENER} does not open it: copy the address into a browser");
             Err(UserError(reason).into())
         }
     }

@@ -193,7 +193,10 @@ fn findings(socket: &SocketChoice) -> Findings {
     Arc::new(move |start, end| {
         let agent = Agent::reach(&target).ok()?;
         // A second more on both sides has the events that were reported with a delay.
-        let (from, to) = (start / NANOSECONDS_PER_SECOND, end.div_ceil(NANOSECONDS_PER_SECOND) + 1);
+        let (from, to) = (
+            start / NANOSECONDS_PER_SECOND,
+            end.div_ceil(NANOSECONDS_PER_SECOND) + 1,
+        );
         let path = format!("/history/events?from={}&to={to}", from.saturating_sub(1));
         let mut lines = agent.stream(&path).ok()?;
         let mut found = Vec::new();

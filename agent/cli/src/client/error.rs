@@ -199,6 +199,9 @@ mod tests {
     fn a_reason_omits_the_error_number_of_the_system() {
         let refused = io::Error::from_raw_os_error(111);
         assert_eq!(io_error_text(&refused), "connection refused");
-        assert_eq!(io_error_text(&io::Error::other("Name unknown")), "name unknown");
+        assert_eq!(
+            io_error_text(&io::Error::other("Name unknown")),
+            "name unknown"
+        );
     }
 }

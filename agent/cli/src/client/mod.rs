@@ -235,7 +235,8 @@ impl Agent {
 
     /// Decodes the JSON of a line or an answer.
     fn decoded<T: DeserializeOwned>(&self, path: &str, text: &[u8]) -> Result<T, ClientError> {
-        serde_json::from_slice(text).map_err(|source| self.transport.unreadable_answer(path, source))
+        serde_json::from_slice(text)
+            .map_err(|source| self.transport.unreadable_answer(path, source))
     }
 
     /// Returns the error of a connection that closed before the answer.
@@ -309,7 +310,11 @@ impl Agent {
     }
 
     /// Reads the whole body of a successful answer; problem details become an error.
-    async fn read_body(&self, path: &str, answer: Response<Incoming>) -> Result<Bytes, ClientError> {
+    async fn read_body(
+        &self,
+        path: &str,
+        answer: Response<Incoming>,
+    ) -> Result<Bytes, ClientError> {
         let status = answer.status();
         let mut body = Limited::new(answer.into_body(), MAX_ANSWER);
         let mut whole = BytesMut::new();

@@ -149,15 +149,17 @@ impl Transport {
         &self,
         connect: impl Future<Output = io::Result<S>>,
     ) -> Result<S, ClientError> {
-        with_connect_timeout(connect).await.map_err(|source| match self {
-            Self::Socket(path) if source.kind() == io::ErrorKind::PermissionDenied => {
-                ClientError::Denied { path: path.clone() }
-            }
-            _ => ClientError::Unreachable {
-                place: self.to_string(),
-                source,
-            },
-        })
+        with_connect_timeout(connect)
+            .await
+            .map_err(|source| match self {
+                Self::Socket(path) if source.kind() == io::ErrorKind::PermissionDenied => {
+                    ClientError::Denied { path: path.clone() }
+                }
+                _ => ClientError::Unreachable {
+                    place: self.to_string(),
+                    source,
+                },
+            })
     }
 
     async fn exchange<S>(

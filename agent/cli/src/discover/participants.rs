@@ -74,11 +74,11 @@ pub fn listen(configured: CaptureSettings, listening: &Listening) -> Result<Vec<
         live.poll(left.min(POLL_INTERVAL), None, &mut observer)?;
         observer.input(Input::Time(live.clock()));
         live.apply(&observer.drain().interest);
-        let mut heard = observer.snapshot(live.clock()).participants;
-        heard.retain(is_meant);
-        let is_found = listening.participant.is_some() && !heard.is_empty();
+        let mut found = observer.snapshot(live.clock()).participants;
+        found.retain(is_meant);
+        let is_found = listening.participant.is_some() && !found.is_empty();
         if left.is_zero() || is_found {
-            return Ok(heard.iter().map(FoundParticipant::of).collect());
+            return Ok(found.iter().map(FoundParticipant::of).collect());
         }
     }
 }

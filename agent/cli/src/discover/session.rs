@@ -18,8 +18,7 @@ use ros2probe_wire::{EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
 
 use super::announcer::Announcer;
 use super::message::{
-    LocalParticipant, MAX_NUMBERS, Message, NODES_READER, PUBLICATIONS_READER,
-    SUBSCRIPTIONS_READER,
+    LocalParticipant, MAX_NUMBERS, Message, NODES_READER, PUBLICATIONS_READER, SUBSCRIPTIONS_READER,
 };
 use crate::tables::{DiscoveredEndpoints, PartialAnnouncements, UserWriters};
 use ros2probe_model::facts::bounded::Bounded;
@@ -98,7 +97,7 @@ pub struct Session {
     nodes: Nodes,
     sent: Traffic,
     received: Traffic,
-    over: bool,
+    is_finished: bool,
 }
 
 #[derive(Debug)]
@@ -135,7 +134,7 @@ impl Session {
             nodes: Nodes::Open { since: None },
             sent: Traffic::default(),
             received: Traffic::default(),
-            over: false,
+            is_finished: false,
         }
     }
 
@@ -176,7 +175,7 @@ impl Session {
     /// Advances the time. Returns the datagrams to send now.
     pub fn advance(&mut self, now: Timestamp) -> Vec<Outgoing> {
         let mut outgoing = Vec::new();
-        if self.over {
+        if self.is_finished {
             return outgoing;
         }
         if self.sent.packets == 0 {
@@ -202,7 +201,7 @@ impl Session {
     /// Returns the goodbye, if it has not been sent.
     pub fn say_goodbye(&mut self) -> Vec<Outgoing> {
         let mut outgoing = Vec::new();
-        if !self.over && self.sent.packets > 0 {
+        if !self.is_finished && self.sent.packets > 0 {
             self.end(&mut outgoing);
         }
         outgoing
@@ -217,7 +216,7 @@ impl Session {
     /// Returns whether the session has ended.
     #[must_use]
     pub const fn is_over(&self) -> bool {
-        self.over
+        self.is_finished
     }
 
     /// Returns whether the participant sent a HEARTBEAT of a writer of SEDP.
@@ -384,10 +383,12 @@ impl Session {
     /// Requests announcements after both writers have sent a HEARTBEAT. Repeats the request for
     /// further samples, or after a timeout.
     fn request_announcements(&mut self, now: Timestamp, outgoing: &mut Vec<Outgoing>) {
-        let Some(heard) = self.first_heartbeat else { return };
+        let Some(first_heartbeat_at) = self.first_heartbeat else {
+            return;
+        };
         let both = self.publications.available.is_some() && self.subscriptions.available.is_some();
         let due = match self.last_request {
-            None => both || now - heard >= REQUEST_DELAY,
+            None => both || now - first_heartbeat_at >= REQUEST_DELAY,
             Some(asked) => {
                 let came = self.publications.is_answered() && self.subscriptions.is_answered();
                 came || now - asked >= REQUEST_TIMEOUT
@@ -475,13 +476,13 @@ impl Session {
 
     /// Returns whether all available answers have arrived.
     fn is_complete(&mut self, now: Timestamp) -> bool {
-        let Some(heard) = self.first_heartbeat else {
+        let Some(first_heartbeat_at) = self.first_heartbeat else {
             return false;
         };
         let settled = match self.last_request {
             Some(asked) => self.missing() == 0 || now - asked >= REQUEST_TIMEOUT,
             // A participant without endpoints sends HEARTBEATs with firstSN 1 and lastSN 0.
-            None => now - heard >= REQUEST_DELAY && self.missing() == 0,
+            None => now - first_heartbeat_at >= REQUEST_DELAY && self.missing() == 0,
         };
         if !settled {
             return false;
@@ -499,7 +500,7 @@ impl Session {
     fn end(&mut self, outgoing: &mut Vec<Outgoing>) {
         let message = self.message().goodbye(self.local);
         self.send(self.to_discovery("goodbye", message), outgoing);
-        self.over = true;
+        self.is_finished = true;
     }
 
     fn message(&self) -> Message {

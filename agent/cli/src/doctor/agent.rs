@@ -91,7 +91,8 @@ fn running_finding(health: &Health, place: &str) -> Finding {
         .map_or_else(String::new, |up| format!(", up {}", duration(up)));
     let finding = if health.ready {
         let sentence = format!("the agent is running and sees traffic{since}");
-        Finding::new(AREA, "ready", Severity::Ok, sentence).seen("true", format!("{HEALTH_SOURCE} ready"))
+        Finding::new(AREA, "ready", Severity::Ok, sentence)
+            .seen("true", format!("{HEALTH_SOURCE} ready"))
     } else {
         let reason = health.reason.as_deref().unwrap_or("it gives no reason");
         let sentence = format!("the agent is running but sees nothing: {reason}");

@@ -50,7 +50,9 @@ pub fn check(host: &HostState) -> Vec<Finding> {
                 report(Severity::Warning, sentence).remedy(
                     "sudo apt install chrony    # on every host; for microseconds: linuxptp",
                 )
-            } else if state.maximum_error > COARSE_ERROR_MICROSECONDS && state.estimated_error > COARSE_ERROR_MICROSECONDS {
+            } else if state.maximum_error > COARSE_ERROR_MICROSECONDS
+                && state.estimated_error > COARSE_ERROR_MICROSECONDS
+            {
                 let sentence = format!(
                     "the clock is synchronised to {estimated} ms ({kept}): shorter latencies \
                      between hosts are not meaningful"
@@ -100,10 +102,15 @@ pub fn compared(clocks: &Clocks<'_>) -> Option<Finding> {
             .total_cmp(&one.offset_seconds.abs())
     });
     let apart = own.iter().filter(|offset| {
-        1e6 * (offset.offset_seconds.abs() - offset.uncertainty_seconds) > COARSE_ERROR_MICROSECONDS as f64
+        1e6 * (offset.offset_seconds.abs() - offset.uncertainty_seconds)
+            > COARSE_ERROR_MICROSECONDS as f64
     });
     let apart = apart.count();
-    let listed: Vec<_> = own.iter().take(MAX_NAMED_HOSTS).map(|offset| shown(offset)).collect();
+    let listed: Vec<_> = own
+        .iter()
+        .take(MAX_NAMED_HOSTS)
+        .map(|offset| shown(offset))
+        .collect();
     let severity = if apart > 0 {
         Severity::Warning
     } else {

@@ -128,7 +128,9 @@ fn sysctl(remedy: &Remedy) -> Option<(&str, u64)> {
     let (key, value) = line.split_once('=')?;
     let is_name =
         |each: char| each.is_ascii_lowercase() || each.is_ascii_digit() || "._".contains(each);
-    let is_safe = SAFE_SYSCTL_PREFIXES.iter().any(|prefix| key.starts_with(prefix));
+    let is_safe = SAFE_SYSCTL_PREFIXES
+        .iter()
+        .any(|prefix| key.starts_with(prefix));
     let is_safe = is_safe && key.chars().all(is_name) && !key.contains("..");
     let value = value.parse().ok().filter(|_| is_safe)?;
     (remedy.kind == RemedyTarget::Command).then_some((key, value))

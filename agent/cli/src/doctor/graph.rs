@@ -396,7 +396,11 @@ fn mismatches(topics: &[Topic<'_>]) -> Vec<Finding> {
         if found.is_empty() {
             return None;
         }
-        let sentence = format!("{} {words}: {}", counted_noun(found.len(), "topic"), name_list(&found));
+        let sentence = format!(
+            "{} {words}: {}",
+            counted_noun(found.len(), "topic"),
+            name_list(&found)
+        );
         let finding = Finding::new(AREA, kind, Severity::Warning, sentence);
         let finding = finding.seen(found.len().to_string(), "GET /topics diagnoses");
         Some(finding.remedy(remedy))

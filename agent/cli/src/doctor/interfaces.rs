@@ -35,7 +35,11 @@ pub fn check(host: &HostState, agent: Option<&Health>, localhost: bool) -> Vec<F
         Err(error) => {
             let sentence = "the network interfaces are unknown";
             let finding = Finding::new(AREA, "interfaces", Severity::Unknown, sentence);
-            return vec![finding.seen(error.to_string(), SYS_CLASS_NET).remedy("ip link")];
+            return vec![
+                finding
+                    .seen(error.to_string(), SYS_CLASS_NET)
+                    .remedy("ip link"),
+            ];
         }
     };
     if let Some(finding) = elsewhere(host, &names) {
@@ -45,7 +49,9 @@ pub fn check(host: &HostState, agent: Option<&Health>, localhost: bool) -> Vec<F
     let mut findings = vec![overview(&all)];
     findings.extend(loopback(&all, localhost));
     let used = || all.iter().filter(|each| each.is_used());
-    let mute: Vec<_> = used().filter(|each| each.flags & IFF_MULTICAST == 0).collect();
+    let mute: Vec<_> = used()
+        .filter(|each| each.flags & IFF_MULTICAST == 0)
+        .collect();
     if !mute.is_empty() {
         let names = list(&mute);
         let sentence = format!(
@@ -112,9 +118,14 @@ fn elsewhere(host: &HostState, names: &[String]) -> Option<Finding> {
 }
 
 fn read(host: &HostState, name: &str) -> Option<Interface> {
-    let flags = host.files.text(&format!("{SYS_CLASS_NET}/{name}/flags")).ok()?;
+    let flags = host
+        .files
+        .text(&format!("{SYS_CLASS_NET}/{name}/flags"))
+        .ok()?;
     let flags = u32::from_str_radix(flags.strip_prefix("0x")?, 16).ok()?;
-    let state = host.files.text(&format!("{SYS_CLASS_NET}/{name}/operstate"));
+    let state = host
+        .files
+        .text(&format!("{SYS_CLASS_NET}/{name}/operstate"));
     Some(Interface {
         name: name.to_owned(),
         flags,
@@ -139,7 +150,8 @@ impl Interface {
 
 fn overview(all: &[Interface]) -> Finding {
     let report = |severity, sentence: String| {
-        Finding::new(AREA, "interfaces", severity, sentence).seen(all.len().to_string(), SYS_CLASS_NET)
+        Finding::new(AREA, "interfaces", severity, sentence)
+            .seen(all.len().to_string(), SYS_CLASS_NET)
     };
     let used: Vec<_> = all.iter().filter(|each| each.is_used()).collect();
     if used.is_empty() {
@@ -250,7 +262,10 @@ mod tests {
         let mut files = Vec::new();
         for (name, flags, mtu, state) in interfaces {
             for (file, text) in [("flags", flags), ("mtu", mtu), ("operstate", state)] {
-                files.push((format!("{SYS_CLASS_NET}/{name}/{file}"), format!("{text}\n")));
+                files.push((
+                    format!("{SYS_CLASS_NET}/{name}/{file}"),
+                    format!("{text}\n"),
+                ));
             }
         }
         let files: Vec<_> = files

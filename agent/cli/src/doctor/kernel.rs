@@ -155,7 +155,8 @@ fn control_groups(host: &HostState) -> Finding {
         hierarchy @ (CgroupHierarchy::NotMounted | CgroupHierarchy::Version1) => {
             let sentence = "no cgroup v2 hierarchy is mounted: the agent can observe interfaces \
                 only, not sockets";
-            let finding = report(Severity::Warning, sentence.to_owned()).seen("no cgroup2", MOUNTS_PATH);
+            let finding =
+                report(Severity::Warning, sentence.to_owned()).seen("no cgroup2", MOUNTS_PATH);
             if hierarchy == CgroupHierarchy::NotMounted {
                 return finding.remedy("sudo mount -t cgroup2 none /sys/fs/cgroup");
             }
@@ -318,7 +319,11 @@ mod tests {
         gives((BTF_PATH, "gone"), "types", Severity::Warning);
         gives((JIT_PATH, "0"), "jit", Severity::Warning);
         gives((JIT_PATH, "gone"), "jit", Severity::Ok);
-        gives((UNPRIVILEGED_BPF_PATH, "0"), "unprivileged_bpf", Severity::Note);
+        gives(
+            (UNPRIVILEGED_BPF_PATH, "0"),
+            "unprivileged_bpf",
+            Severity::Note,
+        );
         let locked = "none integrity [confidentiality]";
         gives((LOCKDOWN_PATH, locked), "lockdown", Severity::Warning);
         gives(
@@ -327,14 +332,17 @@ mod tests {
             Severity::Ok,
         );
         gives(
-            (MOUNTS_PATH, "24 18 0:22 / /sys/fs/cgroup rw - cgroup cgroup rw"),
+            (
+                MOUNTS_PATH,
+                "24 18 0:22 / /sys/fs/cgroup rw - cgroup cgroup rw",
+            ),
             "cgroup",
             Severity::Warning,
         );
     }
 
     #[test]
-    fn the_limit_on_locked_memory_matters_on_kernels_that_charge_it() {
+    fn the_limit_on_locked_memory_is_checked_on_kernels_that_charge_it() {
         let limit =
             |value: &str| format!("Max locked memory         {value}    {value}    bytes\n");
         for (release, limit, severity) in [

@@ -85,7 +85,9 @@ pub fn examine(host: &HostState, configured: &Configured, reach: &Reach) -> Repo
     });
     findings.extend(kernel::check(host, answers.is_some()));
     findings.extend(privileges::check(host, &config.capture, answers));
-    findings.extend(privileges::of_container(container::namespace_restrictions(config)));
+    findings.extend(privileges::of_container(container::namespace_restrictions(
+        config,
+    )));
     findings.extend(interfaces::check(host, health, is_local));
     findings.extend(shell::check(host));
     findings.extend(processes.check(host));
@@ -104,8 +106,8 @@ pub fn examine(host: &HostState, configured: &Configured, reach: &Reach) -> Repo
     report(name_of(host), findings)
 }
 
-/// Returns a doctor that checks this host for the clients of its agent. Checks of a user's shell and
-/// rights belong to the command alone.
+/// Returns a doctor that checks this host for the clients of its agent. Checks of a user's shell
+/// and rights belong to the command alone.
 #[must_use]
 pub fn of_agent() -> Doctor {
     Doctor::new(|own| match Answers::of(own) {
@@ -208,7 +210,11 @@ mod tests {
     #[test]
     fn without_files_and_privileges_each_area_is_reported_once_in_order() {
         let (_directory, host) = host(&[]);
-        let report = examine(&host, &configured(), &Reach::NoAnswer("no agent".to_owned()));
+        let report = examine(
+            &host,
+            &configured(),
+            &Reach::NoAnswer("no agent".to_owned()),
+        );
         let listed = areas(&report);
         let mut once = listed.clone();
         once.sort();

@@ -68,7 +68,10 @@ fn own_privileges(host: &HostState, settings: &CaptureSettings, is_running: bool
         ),
         Some(missing) => report(
             Severity::Note,
-            format!("this shell cannot capture: it lacks {}", missing.missing_text()),
+            format!(
+                "this shell cannot capture: it lacks {}",
+                missing.missing_text()
+            ),
         )
         .remedy("sudo rp run    # or the service ros2probe")
         .remedy(missing.command()),
@@ -119,7 +122,11 @@ fn containers(answers: &Answers) -> Option<Finding> {
         .abilities
         .iter()
         .any(|each| each.able && each.ability == "shared_memory");
-    let is_container = |group: &str| CONTAINER_CGROUP_WORDS.iter().any(|word| group.contains(word));
+    let is_container = |group: &str| {
+        CONTAINER_CGROUP_WORDS
+            .iter()
+            .any(|word| group.contains(word))
+    };
     let mut participants = answers.participants.participants.iter();
     let contained =
         participants.any(|each| each.process.cgroup.as_deref().is_some_and(is_container));
@@ -280,9 +287,15 @@ mod tests {
                 .iter()
                 .any(|remedy| remedy.line.starts_with("sudo setcap "))
         );
-        assert_eq!(own_privileges(&host, &settings, true).severity, Severity::Ok);
+        assert_eq!(
+            own_privileges(&host, &settings, true).severity,
+            Severity::Ok
+        );
         host.capabilities = CapabilitySet::SYS_ADMIN | CapabilitySet::NET_ADMIN;
-        assert_eq!(own_privileges(&host, &settings, false).severity, Severity::Ok);
+        assert_eq!(
+            own_privileges(&host, &settings, false).severity,
+            Severity::Ok
+        );
     }
 
     #[test]

@@ -40,7 +40,10 @@ fn answering(ports: &[Ros2DaemonPort]) -> Option<Finding> {
         "the agent answers as the ros2 daemon of domain{plural} {domains}; no participant for: {DAEMON_COMMANDS}"
     );
     let finding = Finding::new(AREA, CHECK_NAME, Severity::Ok, sentence);
-    Some(finding.seen(format!("still a participant for: {DIRECT_COMMANDS}"), HEALTH_SOURCE))
+    Some(finding.seen(
+        format!("still a participant for: {DIRECT_COMMANDS}"),
+        HEALTH_SOURCE,
+    ))
 }
 
 /// Returns the finding for a port that the agent does not have.
@@ -53,7 +56,8 @@ fn elsewhere(port: &Ros2DaemonPort, daemons: &[(u32, Option<u32>)]) -> Finding {
     } = port;
     let report = |severity, sentence: String| {
         let reason = reason.as_deref().unwrap_or(state);
-        Finding::new(AREA, CHECK_NAME, severity, sentence).seen(reason, format!("{HEALTH_SOURCE}, port {port}"))
+        Finding::new(AREA, CHECK_NAME, severity, sentence)
+            .seen(reason, format!("{HEALTH_SOURCE}, port {port}"))
     };
     match state.as_ref() {
         "occupied" => {

@@ -111,7 +111,10 @@ fn implementation(variables: &Variables) -> Finding {
             "the default implementation of ROS (Fast DDS)".to_owned(),
         ),
         Some(
-            name @ ("rmw_fastrtps_cpp" | "rmw_fastrtps_dynamic_cpp" | "rmw_cyclonedds_cpp" | RMW_ZENOH),
+            name @ ("rmw_fastrtps_cpp"
+            | "rmw_fastrtps_dynamic_cpp"
+            | "rmw_cyclonedds_cpp"
+            | RMW_ZENOH),
         ) => report(Severity::Ok, name.to_owned()),
         Some(name @ ("rmw_connextdds" | "rmw_connextddsmicro")) => report(
             Severity::Note,

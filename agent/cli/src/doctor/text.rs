@@ -123,7 +123,9 @@ impl Page {
         let own = remedy.comment.as_deref().map(visible);
         let comment = match (remedy.kind, own) {
             (RemedyTarget::Configuration, None) => Some(CONFIGURATION_FILE.to_owned()),
-            (RemedyTarget::Configuration, Some(own)) => Some(format!("{CONFIGURATION_FILE}; {own}")),
+            (RemedyTarget::Configuration, Some(own)) => {
+                Some(format!("{CONFIGURATION_FILE}; {own}"))
+            }
             (RemedyTarget::Command | RemedyTarget::Elsewhere, own) => own.map(Cow::into_owned),
         };
         let mut short = String::new();

@@ -163,8 +163,8 @@ impl Answers {
 
     /// Returns the properties of a robot that are compared.
     fn traits(&self, name: &str) -> BTreeMap<String, Trait> {
-        // Several domains, or topics that differ by a number, may have one key. The order in which an
-        // engine returns them is not defined.
+        // Several domains, or topics that differ by a number, may have one key. The order in which
+        // an engine returns them is not defined.
         let mut texts = BTreeMap::<String, BTreeSet<String>>::new();
         // A topic without publishers has no type and no quality of service.
         let mut text = |key: String, text: String| {

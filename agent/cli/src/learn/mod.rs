@@ -171,7 +171,12 @@ impl Learner {
     #[must_use]
     pub fn finish(&self) -> Option<Learnt> {
         let period = self.period.filter(|_| self.seconds > 0)?;
-        let count = |wanted: &str| self.unwatchable.values().filter(|why| **why == wanted).count();
+        let count = |wanted: &str| {
+            self.unwatchable
+                .values()
+                .filter(|why| **why == wanted)
+                .count()
+        };
         let lessons = self.topics.iter();
         Some(Learnt {
             lessons: lessons

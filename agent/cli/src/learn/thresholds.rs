@@ -166,7 +166,9 @@ impl<'a> Draft<'a> {
             return self.omit(KEYS, why);
         }
         let default = rehearsal::window(lowest);
-        let wider = WINDOW_SECONDS.into_iter().filter(|seconds| *seconds > default);
+        let wider = WINDOW_SECONDS
+            .into_iter()
+            .filter(|seconds| *seconds > default);
         let lengths = std::iter::once(default).chain(wider);
         let windows: Vec<Windows> = lengths
             .filter_map(|seconds| self.windows(seconds, default))
@@ -175,7 +177,9 @@ impl<'a> Draft<'a> {
             return self.omit(KEYS, "no message arrived for most of the time");
         };
         // The shortest window is best that detects half the rate and that the topic never violates.
-        let usual = |it: &&Windows| it.is_above(it.min_rates()[0]) && self.accepts_low(it, it.min_rates()[0]);
+        let usual = |it: &&Windows| {
+            it.is_above(it.min_rates()[0]) && self.accepts_low(it, it.min_rates()[0])
+        };
         let widest = |it: &&Windows| self.accepts_low(it, it.min_rates()[1]);
         let chosen = windows.iter().find(usual);
         let chosen = chosen.or_else(|| windows.iter().find(widest));
@@ -476,13 +480,19 @@ impl<'a> Draft<'a> {
 impl Windows {
     /// Returns the usual minimum rate, and the widest one, just below the lowest observed rate.
     fn min_rates(&self) -> [f64; 2] {
-        let lows = [self.rates.median - self.half_band_width(), self.rates.minimum * 0.95];
+        let lows = [
+            self.rates.median - self.half_band_width(),
+            self.rates.minimum * 0.95,
+        ];
         lows.map(rounded_down)
     }
 
     /// Returns the usual maximum rate, and the widest one, just above the highest observed rate.
     fn max_rates(&self) -> [f64; 2] {
-        let highs = [self.rates.median + self.half_band_width(), self.rates.maximum * 1.05];
+        let highs = [
+            self.rates.median + self.half_band_width(),
+            self.rates.maximum * 1.05,
+        ];
         highs.map(rounded_up)
     }
 

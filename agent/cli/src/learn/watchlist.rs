@@ -4,7 +4,8 @@ use std::fmt::Write as _;
 
 use super::Learnt;
 use super::thresholds::{
-    LATENCY_DEVIATIONS, LEAST_LOSS, TopicThresholds, RATE_DEVIATIONS, RATE_MARGIN, Remark, SILENCE_MARGIN,
+    LATENCY_DEVIATIONS, LEAST_LOSS, RATE_DEVIATIONS, RATE_MARGIN, Remark, SILENCE_MARGIN,
+    TopicThresholds,
 };
 use ros2probe_api::parameters::Parameters;
 use ros2probe_daemon::config::MAX_PARAMETERS;
@@ -156,7 +157,10 @@ fn entry(text: &mut String, lesson: &TopicThresholds, source: &Source<'_>, is_ex
             }
             Remark::Set(key, value, why) => {
                 let setting = format!("    {key}: {value}");
-                line(text, &format!("{setting:REASON_COLUMN$}  # {}", visible(why)));
+                line(
+                    text,
+                    &format!("{setting:REASON_COLUMN$}  # {}", visible(why)),
+                );
             }
             Remark::LeftOut(..) if !is_explained => {}
             Remark::LeftOut(keys, why) => {

@@ -36,7 +36,9 @@ pub(super) fn of_feedback(topics: &[Named<'_>]) -> Vec<Named<'static>> {
 
 fn of_name(name: &str, types: &[Cow<'_, str>]) -> Option<Named<'static>> {
     let name = name.strip_suffix(FEEDBACK_TOPIC_SUFFIX)?.to_owned();
-    let types = types.iter().filter_map(|each| each.strip_suffix(FEEDBACK_TYPE_SUFFIX));
+    let types = types
+        .iter()
+        .filter_map(|each| each.strip_suffix(FEEDBACK_TYPE_SUFFIX));
     let types: Vec<_> = types.map(|each| Cow::Owned(each.to_owned())).collect();
     (!types.is_empty()).then_some(Named { name, types })
 }

@@ -56,7 +56,9 @@ pub fn info(bag: &Bag, dialect: Dialect, sort: Sort, details: Option<&Details>) 
     line("End:", &moment(end, zone));
     line(
         "Messages:",
-        &metadata.message_count.saturating_sub(parts.of_services_and_actions),
+        &metadata
+            .message_count
+            .saturating_sub(parts.of_services_and_actions),
     );
     let topics: Vec<String> = parts
         .topics
@@ -150,10 +152,14 @@ impl<'a> Parts<'a> {
             if dialect > Dialect::Jazzy
                 && let Some(part) = of_action()
             {
-                parts.of_services_and_actions = parts.of_services_and_actions.saturating_add(topic.message_count);
+                parts.of_services_and_actions = parts
+                    .of_services_and_actions
+                    .saturating_add(topic.message_count);
                 parts.action(topic, part);
             } else if dialect > Dialect::Humble && is_event {
-                parts.of_services_and_actions = parts.of_services_and_actions.saturating_add(topic.message_count);
+                parts.of_services_and_actions = parts
+                    .of_services_and_actions
+                    .saturating_add(topic.message_count);
                 parts.services.push(topic);
             } else {
                 parts.topics.push(topic);

@@ -269,7 +269,10 @@ impl App {
                 self.keep_scroll_position(before);
             }
             Fact::Gone(why) => {
-                let since = self.unreachable_since.as_ref().map_or(now, |(since, _)| *since);
+                let since = self
+                    .unreachable_since
+                    .as_ref()
+                    .map_or(now, |(since, _)| *since);
                 self.unreachable_since = Some((since, escaped(&why)));
             }
             Fact::Status(text) => self.status = Some((now, escaped(&text))),

@@ -13,7 +13,7 @@ use ros2probe_api::topics::{ReasonCode, Topic, TopicDetails, Watching};
 use super::event_pane::{shown, shown_list};
 use super::inside;
 use super::row::{is_measured, shown_name};
-use super::text::{beginning, bound, bytes, counted, end, rate, ratio, escaped, seconds};
+use super::text::{beginning, bound, bytes, counted, end, escaped, rate, ratio, seconds};
 use super::theme::{Kind, Theme};
 
 /// Maximum number of receivers and destinations without a known reader.
@@ -66,10 +66,13 @@ pub fn lines(details: &TopicDetails<'_>, width: usize, theme: Theme) -> Vec<Styl
         lines.push((format!("why: {}", escaped(&reason.detail)), kind));
     }
     if topic.passages.iter().any(|it| it.passage != "network") {
-        let ways = topic.passages.iter();
-        let ways = ways.map(|it| format!("{} {}", it.pairs, escaped(&it.passage)));
-        let ways: Vec<_> = ways.collect();
-        let line = format!("pairs of publisher and subscriber by: {}", ways.join(", "));
+        let ways_text = topic.passages.iter();
+        let ways_text = ways_text.map(|it| format!("{} {}", it.pairs, escaped(&it.passage)));
+        let ways_text: Vec<_> = ways_text.collect();
+        let line = format!(
+            "pairs of publisher and subscriber by: {}",
+            ways_text.join(", ")
+        );
         lines.push((line, Kind::Plain));
     }
     histograms(details, width, theme, &mut lines);
@@ -295,8 +298,8 @@ fn diagnosis(finding: &Finding<'_>, topic: &Topic<'_>) -> String {
                 Some(reader) => format!("{} takes no buffers", name(reader)),
                 None => "it is transient local".to_owned(),
             };
-            let (who, backends) = (name(writer), shown_list(backends));
-            format!("{who} sends through the CPU instead of {backends}: {why}")
+            let (writer_name, backends) = (name(writer), shown_list(backends));
+            format!("{writer_name} sends through the CPU instead of {backends}: {why}")
         }
         Open::Known(Diagnosis::SlowChain {
             from,
@@ -514,7 +517,10 @@ fn other_receivers(details: &TopicDetails<'_>, theme: Theme, lines: &mut Vec<Sty
     lines.push((heading, Kind::Heading));
     for (to, it) in others.iter().take(MAX_OTHERS) {
         let to = beginning(to, NODE_WIDTH, theme.cut());
-        let line = format!("{to:<NODE_WIDTH$} {:>7} {:>6}", it.messages, it.lost_messages);
+        let line = format!(
+            "{to:<NODE_WIDTH$} {:>7} {:>6}",
+            it.messages, it.lost_messages
+        );
         lines.push((line, Kind::Plain));
     }
     if let Some(more) = others

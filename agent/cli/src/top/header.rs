@@ -165,7 +165,10 @@ fn warnings(app: &App, now: Instant) -> Vec<Styled> {
     };
     if !health.ready {
         let why = health.reason.as_deref().unwrap_or("it gives no reason");
-        warn(format!("the agent does not see the robot: {}", escaped(why)));
+        warn(format!(
+            "the agent does not see the robot: {}",
+            escaped(why)
+        ));
     }
     if health.dropped() > 0 {
         let when = if app.is_dropping(now) {
@@ -191,7 +194,10 @@ fn warnings(app: &App, now: Instant) -> Vec<Styled> {
     }
     if health.unknown_writers > 0 {
         let remedy = health.unknown_writers_remedy.as_deref();
-        let (what, remedy) = (sentence(health.unknown_writers), remedy.unwrap_or(DISCOVER_COMMAND));
+        let (what, remedy) = (
+            sentence(health.unknown_writers),
+            remedy.unwrap_or(DISCOVER_COMMAND),
+        );
         warn(format!("{what}: {}", explanation(&escaped(remedy))));
     }
     if health.topics_rejected > 0 {

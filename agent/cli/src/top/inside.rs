@@ -5,7 +5,7 @@ use std::borrow::Cow;
 use ros2probe_api::diagnosis::Diagnosis;
 use ros2probe_api::inside::{RecentLateCalls, TopicInside};
 
-use super::text::{counted, ratio, escaped, seconds};
+use super::text::{counted, escaped, ratio, seconds};
 
 /// Returns the late calls of a topic's callbacks, as text.
 pub(super) fn late_calls_text(late: &RecentLateCalls<'_>) -> String {
@@ -19,7 +19,7 @@ pub(super) fn late_calls_text(late: &RecentLateCalls<'_>) -> String {
 
 /// Returns the text of a problem that only calls inside processes show; `None` for any other.
 pub(super) fn problem(diagnosis: &Diagnosis<'_>) -> Option<String> {
-    let who = |node: &Option<Cow<'_, str>>, process: &u32| match node {
+    let node_or_process = |node: &Option<Cow<'_, str>>, process: &u32| match node {
         Some(node) => escaped(node),
         None => format!("process {process}"),
     };
@@ -34,7 +34,7 @@ pub(super) fn problem(diagnosis: &Diagnosis<'_>) -> Option<String> {
         } => format!(
             "callback of {} in {} takes {}, {} is {}",
             escaped(&trigger.words()),
-            who(node, process_id),
+            node_or_process(node, process_id),
             seconds(*duration_seconds),
             match own_period {
                 true => "its period",
@@ -50,7 +50,7 @@ pub(super) fn problem(diagnosis: &Diagnosis<'_>) -> Option<String> {
         } => format!(
             "callback of {} in {} waits {} for the executor",
             escaped(&trigger.words()),
-            who(node, process_id),
+            node_or_process(node, process_id),
             seconds(*wait_seconds)
         ),
         Diagnosis::LateCallback {
@@ -64,7 +64,7 @@ pub(super) fn problem(diagnosis: &Diagnosis<'_>) -> Option<String> {
         } => format!(
             "callback of {} in {} was late {late_calls} times in a minute, up to {}: {}",
             escaped(&trigger.words()),
-            who(node, process_id),
+            node_or_process(node, process_id),
             seconds(*longest_seconds),
             escaped(words)
         ),
@@ -74,7 +74,7 @@ pub(super) fn problem(diagnosis: &Diagnosis<'_>) -> Option<String> {
             overwritten_ratio,
         } => format!(
             "{} within the process overwrites {} of the messages",
-            who(node, process_id),
+            node_or_process(node, process_id),
             ratio(*overwritten_ratio)
         ),
         Diagnosis::ReaderQueueOverflow {
@@ -84,7 +84,7 @@ pub(super) fn problem(diagnosis: &Diagnosis<'_>) -> Option<String> {
             ..
         } => format!(
             "{} takes too slowly: its queue loses {} of the messages",
-            who(node, process_id),
+            node_or_process(node, process_id),
             ratio(*lost_ratio)
         ),
         Diagnosis::ObservationSuspended { process_id, .. } => {

@@ -115,7 +115,11 @@ fn handle_input(app: &mut App, poller: &Poller, input: &Receiver<Input>) -> Opti
     let begun = Instant::now();
     let mut is_changed = false;
     loop {
-        let timeout = if is_changed { MIN_REDRAW_INTERVAL } else { MAX_REDRAW_INTERVAL };
+        let timeout = if is_changed {
+            MIN_REDRAW_INTERVAL
+        } else {
+            MAX_REDRAW_INTERVAL
+        };
         let next = match input.recv_timeout(timeout.saturating_sub(begun.elapsed())) {
             Ok(next) => next,
             Err(RecvTimeoutError::Timeout) => return None,

@@ -58,7 +58,7 @@ struct Poll {
     interval: Duration,
     hidden: bool,
     selected: Option<Key>,
-    holds: MeasureRequests,
+    measure_requests: MeasureRequests,
     inputs: SyncSender<Input>,
 }
 
@@ -82,7 +82,7 @@ impl Poller {
             interval,
             hidden: false,
             selected: None,
-            holds: MeasureRequests::new(Arc::clone(&agent), requests.clone()),
+            measure_requests: MeasureRequests::new(Arc::clone(&agent), requests.clone()),
             inputs: inputs.clone(),
         };
         let thread = thread::Builder::new().name("poll".to_owned());
@@ -128,7 +128,7 @@ impl Poll {
                 match asked.recv_timeout(left) {
                     Ok(Request::Command(command)) => self.execute(command),
                     Ok(Request::Lost(key, why)) => {
-                        let status = self.holds.remove_failed(&key, why);
+                        let status = self.measure_requests.remove_failed(&key, why);
                         self.send_measured(status);
                     }
                     Err(RecvTimeoutError::Timeout) => break,
@@ -178,18 +178,18 @@ impl Poll {
                 self.all();
             }
             Command::Toggle(key, name) => {
-                let status = self.holds.toggle(&key, &name);
+                let status = self.measure_requests.toggle(&key, &name);
                 self.send_measured(status);
             }
             Command::Keep(key, name) => {
-                let status = self.holds.keep(&key, &name);
+                let status = self.measure_requests.keep(&key, &name);
                 self.send_measured(status);
             }
         }
     }
 
     fn send_measured(&self, status: String) {
-        self.send(Fact::Measured(self.holds.shown()));
+        self.send(Fact::Measured(self.measure_requests.shown()));
         self.send(Fact::Status(status));
     }
 

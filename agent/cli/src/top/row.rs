@@ -113,17 +113,24 @@ pub struct Past {
 }
 
 impl Past {
-    /// Returns the loss ratio of the last [`LOSS_WINDOW`], or the total one if nothing was sent in it.
-    /// The flag is whether messages were lost in the window.
+    /// Returns the loss ratio of the last [`LOSS_WINDOW`], or the total one if nothing was sent in
+    /// it. The flag is whether messages were lost in the window.
     fn loss(&mut self, topic: &Topic<'_>, now: Instant) -> (Option<f64>, bool) {
         let latest = Counters::of(topic);
         let first = self.notes.front().map(|(_, counters)| *counters);
         let lately = first.and_then(|first| latest.since(first));
         let is_lost = lately.is_some_and(|(_, lost)| lost);
-        let is_due = self.notes.back().is_none_or(|(at, _)| now - *at >= SAMPLE_INTERVAL);
+        let is_due = self
+            .notes
+            .back()
+            .is_none_or(|(at, _)| now - *at >= SAMPLE_INTERVAL);
         if is_due {
             self.notes.push_back((now, latest));
-            while self.notes.front().is_some_and(|(at, _)| now - *at > LOSS_WINDOW) {
+            while self
+                .notes
+                .front()
+                .is_some_and(|(at, _)| now - *at > LOSS_WINDOW)
+            {
                 self.notes.pop_front();
             }
         }
@@ -396,8 +403,7 @@ impl Column {
             Self::Publishers => turn(other.publishers.cmp(&one.publishers)),
             Self::Subscribers => turn(other.subscriptions.cmp(&one.subscriptions)),
             Self::State => turn(
-                (one.problems.is_empty(), one.state)
-                    .cmp(&(other.problems.is_empty(), other.state)),
+                (one.problems.is_empty(), one.state).cmp(&(other.problems.is_empty(), other.state)),
             ),
         };
         order.then_with(names)

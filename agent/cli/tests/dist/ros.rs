@@ -233,7 +233,7 @@ fn rp_gets_exactly_the_arguments_and_its_exit_code_is_kept() -> Result<()> {
 }
 
 #[test]
-fn signals_reach_rp_because_it_replaces_python() -> Result<()> {
+fn rp_replaces_python_and_receives_signals() -> Result<()> {
     let prefix = prefix()?;
     let run = [
         "run",

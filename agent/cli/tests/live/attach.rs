@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context as _, Result, ensure};
 use ros2probe_testing::harness::PREFIX;
 use ros2probe_testing::harness::agent::{Agent, get};
-use ros2probe_testing::harness::bpf::{self, Direction, AttachMode};
+use ros2probe_testing::harness::bpf::{self, AttachMode, Direction};
 use ros2probe_testing::harness::cgroup::Cgroup;
 use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
@@ -143,7 +143,7 @@ fn a_recreated_cgroup_is_observed_again_and_reported_while_it_is_missing() -> Re
     let above = Cgroup::create(&name)?;
     let configuration = Configuration::at(above.path())?;
     let mut agent = configuration.start(&elsewhere)?;
-    let tells = |what: &str, round: usize| {
+    let wait_for_event = |what: &str, round: usize| {
         eventually(|| {
             let events = get(
                 &elsewhere,
@@ -176,11 +176,11 @@ fn a_recreated_cgroup_is_observed_again_and_reported_while_it_is_missing() -> Re
         ensure!(able == 0.0, "{able} abilities without a cgroup");
         let health = agent.request("/healthz");
         ensure!(health.is_ok(), "the agent is gone: {health:?}");
-        tells("\"ros2probe.capture.blind\"", round)?;
-        tells("was removed", round)?;
+        wait_for_event("\"ros2probe.capture.blind\"", round)?;
+        wait_for_event("was removed", round)?;
         std::fs::create_dir(above.path())?;
         agent.wait_ready(PATIENCE)?;
-        tells("\"ros2probe.capture.seeing\"", round)?;
+        wait_for_event("\"ros2probe.capture.seeing\"", round)?;
         for direction in DIRECTIONS {
             let attached = bpf::attached(above.path(), direction)?;
             ensure!(attached == PROGRAMS, "{attached} programs are attached");
@@ -323,7 +323,10 @@ impl Streams {
         }
         // Fast DDS notifies its subscriber before the publisher.
         std::thread::sleep(Duration::from_millis(300));
-        talks.publishers.iter_mut().try_for_each(Peer::start_sending)?;
+        talks
+            .publishers
+            .iter_mut()
+            .try_for_each(Peer::start_sending)?;
         Ok(talks)
     }
 

@@ -149,7 +149,7 @@ fn images_maps_scans_and_poses_have_a_picture() -> Result<()> {
     }
     agent.scrape_until("all nodes", |page| page.sum("ros2_nodes", &[]) == 5.0)?;
     let mut passed = 0.0;
-    let said = || {
+    let output_text = || {
         passed += 0.5;
         let messages = [
             robot_pictures::image(20, 10, [200, 30, 10]),
@@ -164,7 +164,9 @@ fn images_maps_scans_and_poses_have_a_picture() -> Result<()> {
         }
         Ok(())
     };
-    while_repeating(said, || watch(&link.monitor.inside(), "previews", &[PAGE]))
+    while_repeating(output_text, || {
+        watch(&link.monitor.inside(), "previews", &[PAGE])
+    })
 }
 
 /// Repeats an action each second until another one has ended.
@@ -548,7 +550,7 @@ fn a_token_grants_rights_that_loopback_does_not_have() -> Result<()> {
 /// Measures the first useful paint with 500 topics, the layout of large graphs, and a tab's memory.
 #[test]
 #[ignore = "measures for minutes: make page-bench"]
-fn measurements() -> Result<()> {
+fn paint_layout_and_memory_of_the_page_are_measured() -> Result<()> {
     let minutes = std::env::var("MEASURE_MINUTES").map_or(Ok(2), |text| text.parse::<u64>())?;
     let seconds = 60 + minutes * 60;
     let capture = large_robot(false, seconds)?;

@@ -100,7 +100,7 @@ fn camera(host: &Namespace) -> Result<Peer> {
 
 // Coverage: buffer topics, cpu | Zenoh 1.10 | as Lyrical | exact
 #[test]
-fn messages_of_zenoh_with_buffers_count_once_whatever_its_subscriptions_accept() -> Result<()> {
+fn zenoh_messages_with_buffers_count_once_for_all_subscriptions() -> Result<()> {
     let (host, directory) = (Namespace::isolated()?, tempfile::tempdir()?);
     let agent = start(&host, &directory)?;
     let _router = peer::router(&host, &[])?;

@@ -13,8 +13,8 @@ use serde_json::Value;
 
 /// Rate of the messages to the agent's host, in hertz.
 const RATE: f64 = 20.0;
-/// Rate of the messages from it. Cyclone DDS requests an acknowledgement with a message that is 80 ms
-/// or more after the one before, and with no other.
+/// Rate of the messages from it. Cyclone DDS requests an acknowledgement with a message that is 80
+/// ms or more after the one before, and with no other.
 const RATE_BACK: f64 = 5.0;
 /// Maximum time until the agent knows the offset well.
 const PATIENCE: Duration = Duration::from_secs(60);

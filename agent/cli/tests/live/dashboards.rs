@@ -257,7 +257,9 @@ impl Question {
     fn needs_an_answer(&self) -> bool {
         let name = self.name.as_str();
         let alert = name.starts_with("Ros2");
-        let empty = EXPECTED_EMPTY_QUERIES.iter().any(|(panel, _)| *panel == name);
+        let empty = EXPECTED_EMPTY_QUERIES
+            .iter()
+            .any(|(panel, _)| *panel == name);
         !empty && (!alert || EXPECTED_ALERTS.contains(&name))
     }
 }

@@ -66,9 +66,13 @@ fn an_hour_of_graph_changes_leaves_the_graph_correct_and_the_memory_flat() -> Re
     let agents = [("on the wire", &wire), ("at the sockets", &sockets)];
     for curve in &observed(agents, &mut crowd, long)? {
         let last = curve.needs.last().context("nothing was drawn")?;
-        eprintln!("{}: {} births; at the end {last}", curve.name, crowd.participants_created());
+        eprintln!(
+            "{}: {} births; at the end {last}",
+            curve.name,
+            crowd.participants_created()
+        );
         if let Some(long) = long {
-            memory_is_flat(curve, long)?;
+            check_flat_memory(curve, long)?;
         }
     }
     // By default, at most 1000 topics are measured, and the agent counts further ones.
@@ -130,7 +134,7 @@ fn observed(
     })
 }
 
-fn memory_is_flat(curve: &Curve, long: Duration) -> Result<()> {
+fn check_flat_memory(curve: &Curve, long: Duration) -> Result<()> {
     curve.is_level()?;
     let growth = |part: f64| {
         let growth = curve.growth(long.as_secs_f64() * part);
@@ -148,7 +152,10 @@ fn memory_is_flat(curve: &Curve, long: Duration) -> Result<()> {
     );
     soak::outcome(&format!("changing graph, {}", curve.name), &text)?;
     ensure!(
-        slope <= GROWTH && end <= GROWTH && filling_slope <= MAX_MEMORY_RISE && filling <= MAX_MEMORY_RISE,
+        slope <= GROWTH
+            && end <= GROWTH
+            && filling_slope <= MAX_MEMORY_RISE
+            && filling <= MAX_MEMORY_RISE,
         "{}: {text}",
         curve.name
     );
@@ -423,7 +430,10 @@ fn clock_steps_forward_and_back_leave_leases_rates_and_readiness_correct() -> Re
             "{shown} s old, {rate} Hz"
         );
         ensure!(ready == "200", "{ready}");
-        ensure!(robot.expired_participants()? == expired, "leases ended by a clock");
+        ensure!(
+            robot.expired_participants()? == expired,
+            "leases ended by a clock"
+        );
         crowd.live(Duration::from_secs(1))?;
         views.compare(&mut crowd)?;
         let text = "no lease ended, no absurd rate, ready, events and messages exact";

@@ -21,7 +21,7 @@ mod experiment;
 mod repair;
 
 use anyhow::{Result, ensure};
-use experiment::{Experiment, Size, InjectedFault};
+use experiment::{Experiment, InjectedFault, Size};
 use repair::Repair;
 use ros2probe_testing::harness::peer::Stack;
 

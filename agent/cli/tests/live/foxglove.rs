@@ -14,7 +14,7 @@ use ros2probe_testing::harness::dissection::{Content, Dissection};
 use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream, pair};
 use ros2probe_testing::harness::usage::Usage;
-use ros2probe_testing::viewer::{ServerMessage, PATIENCE, SUBPROTOCOLS, Viewer, open};
+use ros2probe_testing::viewer::{PATIENCE, SUBPROTOCOLS, ServerMessage, Viewer, open};
 use tempfile::TempDir;
 
 use crate::browser::player::watch;
@@ -70,15 +70,15 @@ fn subscribe(scene: &Scene<'_>, viewer: &mut Viewer) -> Result<u32> {
 
 #[test]
 fn payloads_of_fast_dds_reach_a_viewer_unchanged() -> Result<()> {
-    payloads_are_as_sent(Stack::Fast, 2_720_000)
+    check_payloads(Stack::Fast, 2_720_000)
 }
 
 #[test]
 fn payloads_of_cyclone_dds_reach_a_viewer_unchanged() -> Result<()> {
-    payloads_are_as_sent(Stack::Cyclone, 644_000)
+    check_payloads(Stack::Cyclone, 644_000)
 }
 
-fn payloads_are_as_sent(stack: Stack, size: usize) -> Result<()> {
+fn check_payloads(stack: Stack, size: usize) -> Result<()> {
     let link = Link::new()?;
     let configuration = format!("{}watch: []\n", at_the_sockets_of(&link.robot));
     let scene = Scene::start(&link.robot, &configuration)?;
@@ -129,7 +129,7 @@ fn payloads_are_as_sent(stack: Stack, size: usize) -> Result<()> {
                 reported = count.parse()?;
             }
             Some(ServerMessage::Channels | ServerMessage::Data(_)) => {}
-            news => bail!("{news:?} after {:?}", received.keys()),
+            server_message => bail!("{server_message:?} after {:?}", received.keys()),
         }
     }
     publisher.wait_sent(PATIENCE)?;
@@ -162,7 +162,8 @@ fn payloads_are_as_sent(stack: Stack, size: usize) -> Result<()> {
     if stack == Stack::Cyclone {
         // The channel vanishes with the topic, once the lease of the killed nodes ends.
         drop((publisher, subscriber));
-        let is_gone = |viewer: &Viewer, _: &ServerMessage| viewer.channel(TOPIC).is_none().then_some(());
+        let is_gone =
+            |viewer: &Viewer, _: &ServerMessage| viewer.channel(TOPIC).is_none().then_some(());
         viewer.wait_for("end of the channel", is_gone)?;
     }
     Ok(())
@@ -215,7 +216,7 @@ fn a_slow_or_killed_viewer_affects_no_other_viewer_and_no_capture() -> Result<()
                     match viewer.next_within(PATIENCE)? {
                         Some(ServerMessage::Data(data)) => numbers.push(number(&data.payload)?),
                         Some(ServerMessage::Channels) => {}
-                        news => bail!("{news:?} after {numbers:?}"),
+                        server_message => bail!("{server_message:?} after {numbers:?}"),
                     }
                 }
                 Ok((numbers, viewer))
@@ -254,7 +255,10 @@ fn a_slow_or_killed_viewer_affects_no_other_viewer_and_no_capture() -> Result<()
                     .parse()?;
             }
             Some(ServerMessage::Channels) => {}
-            news => bail!("{news:?} after {} and {reported} reported", numbers.len()),
+            server_message => bail!(
+                "{server_message:?} after {} and {reported} reported",
+                numbers.len()
+            ),
         }
     }
     ensure!(
@@ -336,10 +340,10 @@ fn a_viewer_of_all_topics_causes_no_packet_of_the_robot() -> Result<()> {
         // equally late.
         if let Some(viewer) = &mut viewer {
             let mut count = 0;
-            viewer.wait_for("messages", |viewer, news| {
+            viewer.wait_for("messages", |viewer, server_message| {
                 let is_message = |id| viewer.channels[&viewer.subscriptions[&id]].topic == "/imu";
                 count +=
-                    u32::from(matches!(news, ServerMessage::Data(data) if is_message(data.subscription)));
+                    u32::from(matches!(server_message, ServerMessage::Data(data) if is_message(data.subscription)));
                 (count > 100).then_some(())
             })?;
             ensure!(
@@ -350,7 +354,7 @@ fn a_viewer_of_all_topics_causes_no_packet_of_the_robot() -> Result<()> {
         }
         publisher.wait_sent(PATIENCE)?;
         std::thread::sleep(capture::SETTLE);
-        sent.push(what_was_sent(&recording.finish()?, &ports)?);
+        sent.push(sent_payloads(&recording.finish()?, &ports)?);
     }
     let [without, with] = sent.as_slice() else {
         bail!("{} runs", sent.len());
@@ -363,7 +367,7 @@ fn a_viewer_of_all_topics_causes_no_packet_of_the_robot() -> Result<()> {
     Ok(())
 }
 
-fn what_was_sent(recording: &Path, ports: &BTreeSet<u16>) -> Result<Sent> {
+fn sent_payloads(recording: &Path, ports: &BTreeSet<u16>) -> Result<Sent> {
     let frames = Dissection::read(recording)?.frames;
     let mut sent = Sent {
         announcements: BTreeSet::new(),

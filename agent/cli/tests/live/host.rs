@@ -170,7 +170,8 @@ fn check_doctor(host: &Namespace, socket: &Path, subscriber: u32) -> Result<()> 
     }
     let participants = find("graph", "participants")?["sentence"].as_str();
     // Other participants of this machine may be seen in shared memory.
-    let seen = participants.is_some_and(|said| said.contains("domain 0: 2 Eclipse Cyclone DDS"));
+    let seen =
+        participants.is_some_and(|printed| printed.contains("domain 0: 2 Eclipse Cyclone DDS"));
     assert!(seen, "{participants:?}");
     // Other processes of this machine may be among them.
     let processes = find("processes", "processes")?.to_string();
@@ -182,7 +183,7 @@ fn check_doctor(host: &Namespace, socket: &Path, subscriber: u32) -> Result<()> 
 }
 
 #[test]
-fn a_mirrored_interface_shows_forwarded_messages_and_counts_nothing_twice() -> Result<()> {
+fn a_mirrored_interface_shows_forwarded_messages_once() -> Result<()> {
     let link = Link::new()?;
     let cgroup = link.monitor.cgroup().display();
     let configuration =
@@ -310,11 +311,11 @@ fn a_configured_source_that_is_unavailable_is_an_error() -> Result<()> {
         .args([&network, env!("CARGO_BIN_EXE_rp"), "run", "--config"])
         .arg(&file)
         .output()?;
-    let said = String::from_utf8_lossy(&output.stderr);
+    let printed = String::from_utf8_lossy(&output.stderr);
     assert!(
         !output.status.success()
-            && said.contains("/proc is not a control group of the hierarchy v2"),
-        "{said}"
+            && printed.contains("/proc is not a control group of the hierarchy v2"),
+        "{printed}"
     );
     Ok(())
 }

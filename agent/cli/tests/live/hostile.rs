@@ -145,7 +145,7 @@ fn three_capabilities_suffice_for_an_unprivileged_user() -> Result<()> {
 }
 
 #[test]
-fn shared_memory_that_never_answers_is_reported_and_delays_nothing_else() -> Result<()> {
+fn hanging_shared_memory_is_reported_and_delays_no_other_part() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let file = directory.path().join("ros2probe.yaml");
@@ -172,8 +172,8 @@ fn shared_memory_that_never_answers_is_reported_and_delays_nothing_else() -> Res
     agent.scrape_until("shared memory is not seen", |page| !is_able(page))?;
     eprintln!("it is noticed after {:?}", came.elapsed());
     let reason = agent.request("/readyz").unwrap_err().to_string();
-    let said = "capture.shm: its thread has made no progress for ";
-    assert!(reason.contains(said), "{reason}");
+    let printed = "capture.shm: its thread has made no progress for ";
+    assert!(reason.contains(printed), "{reason}");
 
     // Everything else continues.
     let mut sender = Sender::between(&link.monitor, &link.robot)?;
@@ -259,8 +259,8 @@ fn with_participant_flood(capture: impl Fn(&Link) -> String) -> Result<()> {
     assert_eq!(page.sum("ros2_topic_lost_messages_total", &real), 0.0);
 
     let readiness = agent.request("/readyz")?;
-    let said = "ready\ndegraded: at a limit: participants (1000 of 1000, ";
-    assert!(readiness.starts_with(said), "{readiness}");
+    let printed = "ready\ndegraded: at a limit: participants (1000 of 1000, ";
+    assert!(readiness.starts_with(printed), "{readiness}");
     let [program, arguments @ ..] = &link.robot.outside();
     let doctor = Command::new(program)
         .args(arguments)
@@ -286,7 +286,11 @@ impl Carrier for Paced {
 
 /// Runs a storm against an agent on the robot, and checks the agent during the storm and after a
 /// silence.
-fn start_storm(link: &Link, silence: Duration, storm: impl FnOnce() -> Result<Storm>) -> Result<()> {
+fn start_storm(
+    link: &Link,
+    silence: Duration,
+    storm: impl FnOnce() -> Result<Storm>,
+) -> Result<()> {
     let directory = tempfile::tempdir()?;
     let file = directory.path().join("ros2probe.yaml");
     std::fs::write(&file, format!("watch: [/**]\nlog: warn\n{ON_THE_WIRE}"))?;
@@ -401,6 +405,6 @@ fn check_new_participants(agent: &Agent<'_>, link: &Link) -> Result<()> {
 }
 
 fn well_formed(page: &Scrape) {
-    let said = local_agent::promtool(&page.0);
-    assert_eq!(said, "", "{}", page.0);
+    let printed = local_agent::promtool(&page.0);
+    assert_eq!(printed, "", "{}", page.0);
 }

@@ -108,11 +108,11 @@ fn expectations_of_a_live_robot_are_learnt_without_a_watch_and_detect_its_faults
     ensure!(learning.try_wait()?.is_none(), "it ended by itself");
     harness::run(&format!("kill -INT {}", learning.id()))?;
     let output = learning.wait_with_output()?;
-    let said = String::from_utf8(output.stderr)?;
-    ensure!(output.status.success(), "{said}");
+    let printed = String::from_utf8(output.stderr)?;
+    ensure!(output.status.success(), "{printed}");
     ensure!(
-        said.lines().count() == 1 && said.contains("for 2 of 2 topics"),
-        "{said}"
+        printed.lines().count() == 1 && printed.contains("for 2 of 2 topics"),
+        "{printed}"
     );
     is_complete(&place.watchlist)?;
 
@@ -191,10 +191,10 @@ fn rp_learn_writes_no_watchlist_if_the_agent_ends() -> Result<()> {
     })?;
     place.agent.process.terminate()?;
     let output = learning.wait_with_output()?;
-    let said = String::from_utf8(output.stderr)?;
-    let last = said.lines().last().context("no error")?;
-    ensure!(output.status.code() == Some(1), "{said}");
-    ensure!(last.contains("the agent has ended"), "{said}");
+    let printed = String::from_utf8(output.stderr)?;
+    let last = printed.lines().last().context("no error")?;
+    ensure!(output.status.code() == Some(1), "{printed}");
+    ensure!(last.contains("the agent has ended"), "{printed}");
     ensure!(!place.watchlist.exists());
     Ok(())
 }

@@ -276,8 +276,8 @@ fn every_command_of_the_readme_works_against_the_demo() -> Result<()> {
             .args(options.split_whitespace())
             .output()?;
         let text = String::from_utf8_lossy(&output.stdout).into_owned();
-        let said = String::from_utf8_lossy(&output.stderr);
-        ensure!(output.status.success(), "rp {words:?}: {said}");
+        let output_text = String::from_utf8_lossy(&output.stderr);
+        ensure!(output.status.success(), "rp {words:?}: {output_text}");
         ensure!(text.contains(expected), "rp {words:?}: {text}");
     }
     Ok(())

@@ -226,14 +226,14 @@ fn an_agent_that_cannot_drop_its_capabilities_serves_nothing() -> Result<()> {
         command.pre_exec(move || seccompiler::apply_filter(&lie).map_err(io::Error::other));
     }
     let output = command.output()?;
-    let said = String::from_utf8_lossy(&output.stderr);
+    let printed = String::from_utf8_lossy(&output.stderr);
     ensure!(
         output.status.code() == Some(77),
-        "{:?}: {said}",
+        "{:?}: {printed}",
         output.status
     );
-    ensure!(said.contains("refusing to serve: CAP_"), "{said}");
-    ensure!(!said.contains("serving"), "{said}");
+    ensure!(printed.contains("refusing to serve: CAP_"), "{printed}");
+    ensure!(!printed.contains("serving"), "{printed}");
     Ok(())
 }
 

@@ -111,11 +111,11 @@ fn promtool(page: &str) -> Result<()> {
         .context("no input")?
         .write_all(page.as_bytes())?;
     let output = child.wait_with_output()?;
-    let said = [output.stdout, output.stderr].concat();
+    let printed = [output.stdout, output.stderr].concat();
     ensure!(
-        output.status.success() && said.is_empty(),
+        output.status.success() && printed.is_empty(),
         "promtool: {}",
-        String::from_utf8_lossy(&said)
+        String::from_utf8_lossy(&printed)
     );
     Ok(())
 }

@@ -82,8 +82,8 @@ fn ten_clients_print_correct_rates_on_a_busy_machine_and_leave_no_trace() -> Res
         Ok((60.0..=70.0).contains(&bandwidth.last("")))
     })
     .with_context(|| bandwidth.printed().join("\n"))?;
-    let said = delay.last("average delay: ");
-    ensure!((0.0..0.1).contains(&said), "{said} s");
+    let output_text = delay.last("average delay: ");
+    ensure!((0.0..0.1).contains(&output_text), "{output_text} s");
 
     for client in [hz, all, bandwidth, delay] {
         drop(client);
@@ -106,15 +106,15 @@ fn is_the_rate_sent(hz: &Client, publisher: &Peer, subscriber: &Peer) -> Result<
         sent.last().context("nothing")?,
     );
     let true_rate = (sent.len() - 1) as f64 / ((last - first) as f64 / 1e9);
-    let said = hz.last("average rate: ");
+    let output_text = hz.last("average rate: ");
     let heard = subscriber.log()?.sequences("sub").len();
     eprintln!(
-        "said {said}, sent {true_rate:.3} Hz; of {} sent {heard} were received",
+        "said {output_text}, sent {true_rate:.3} Hz; of {} sent {heard} were received",
         sent.len()
     );
     ensure!(
-        (said - true_rate).abs() <= true_rate / 1000.0,
-        "{said} of {true_rate}"
+        (output_text - true_rate).abs() <= true_rate / 1000.0,
+        "{output_text} of {true_rate}"
     );
     Ok(sent.len())
 }
@@ -198,10 +198,10 @@ fn echoing_point_clouds_takes_bounded_memory_and_changes_no_count() -> Result<()
     let (first, last) = (sent.first(), sent.last());
     let (first, last) = (first.context("nothing sent")?, last.context("nothing")?);
     let true_rate = (sent.len() - 1) as f64 / ((last - first) as f64 / 1e9);
-    let said = hz.last("average rate: ");
+    let output_text = hz.last("average rate: ");
     ensure!(
-        (said - true_rate).abs() <= true_rate / 20.0,
-        "{said} of {true_rate}"
+        (output_text - true_rate).abs() <= true_rate / 20.0,
+        "{output_text} of {true_rate}"
     );
     drop(hz);
     check_unsubscribed(&agent, "/points", 50.0)
@@ -239,19 +239,19 @@ fn piped_into_head(socket: &Path) -> Result<()> {
         socket.display()
     );
     let output = Command::new("bash").args(["-c", &script]).output()?;
-    let (said, errors) = (
+    let (output_text, errors) = (
         String::from_utf8_lossy(&output.stdout),
         String::from_utf8_lossy(&output.stderr),
     );
-    let lines: Vec<&str> = said.lines().collect();
+    let lines: Vec<&str> = output_text.lines().collect();
     let [rate, spread, code] = lines[..] else {
-        anyhow::bail!("{said}{errors}");
+        anyhow::bail!("{output_text}{errors}");
     };
     ensure!(
         rate.starts_with("average rate: ") && spread.starts_with("\tmin: "),
-        "{said}"
+        "{output_text}"
     );
-    ensure!(code == "141" && errors.is_empty(), "{said}{errors}");
+    ensure!(code == "141" && errors.is_empty(), "{output_text}{errors}");
     Ok(())
 }
 

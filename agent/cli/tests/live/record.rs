@@ -73,7 +73,7 @@ fn every_message_is_in_the_bags_or_counted_as_missing() -> Result<()> {
         (robot.bags().join("all"), ended["report"].clone()),
         (by_client.clone(), report_of(&by_client)?),
     ] {
-        all_or_counted(&bag, &report, &pairs, &page)?;
+        check_all_or_counted(&bag, &report, &pairs, &page)?;
     }
     if is_exact(&page) {
         for (topic, count, ..) in &pairs {
@@ -127,7 +127,7 @@ fn start_pairs(
 
 /// Checks that each message of the first stretch is in the bag, or counted as missing in the
 /// report.
-fn all_or_counted(bag: &Path, report: &Value, pairs: &[Pair], page: &Scrape) -> Result<()> {
+fn check_all_or_counted(bag: &Path, report: &Value, pairs: &[Pair], page: &Scrape) -> Result<()> {
     let numbers = numbers(bag)?;
     let mut messages = 0;
     for (topic, count, publisher, _) in pairs {
@@ -145,7 +145,11 @@ fn all_or_counted(bag: &Path, report: &Value, pairs: &[Pair], page: &Scrape) -> 
         ensure!(recorded.is_subset(&sent), "{topic}");
         if is_exact(page) {
             let all = recorded.len() as u64 + missing;
-            ensure!(all == *count, "{topic}: {report:#}\n{}", page.doubted_jumps());
+            ensure!(
+                all == *count,
+                "{topic}: {report:#}\n{}",
+                page.doubted_jumps()
+            );
         }
         ensure!(recorded.len() as u64 * 2 > *count, "{topic}: {report:#}");
     }
@@ -196,7 +200,11 @@ fn a_slow_reader_loses_the_largest(robot: &Robot<'_>, pairs: &mut [Pair]) -> Res
         ensure!(recorded.is_subset(&sent), "{topic}");
         if is_exact(&page) {
             let all = recorded.len() as u64 + missing;
-            ensure!(all == *count, "{topic}: {report:#}\n{}", page.doubted_jumps());
+            ensure!(
+                all == *count,
+                "{topic}: {report:#}\n{}",
+                page.doubted_jumps()
+            );
         }
         // The largest messages are dropped first, so small messages stay complete.
         let is_large = *topic == "/front";

@@ -1,5 +1,5 @@
-//! What the robot itself says: diagnostics, parameters and transforms in metrics, API, findings and commands,
-//! without a watch. Needs root.
+//! What the robot itself says: diagnostics, parameters and transforms in metrics, API, findings and
+//! commands, without a watch. Needs root.
 
 use std::process::{Command, Stdio};
 use std::time::Duration;

@@ -59,7 +59,8 @@ fn streams(address: Ipv4Addr) -> [Stream; 3] {
 }
 
 /// Starts a publisher, then a subscriber that connects to it, and waits until they are matched.
-/// Rarely, Fast DDS 2.9 exchanges the first control messages and nothing more: then both start again.
+/// Rarely, Fast DDS 2.9 exchanges the first control messages and nothing more: then both start
+/// again.
 fn pair(from: &Namespace, to: &Namespace, stream: &Stream) -> Result<(Peer, Peer)> {
     for _ in 0..ATTEMPTS {
         let mut publisher = Peer::start(from, Stack::Fast, Role::Publisher, stream, &["/sensor"])?;

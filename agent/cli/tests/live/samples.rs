@@ -36,17 +36,17 @@ const DATA: usize = 52;
 
 #[test]
 fn payloads_of_fast_dds_equal_those_that_were_sent() -> Result<()> {
-    payloads_are_what_was_sent(Stack::Fast, &SIZES, at_the_sockets_of)
+    check_payloads(Stack::Fast, &SIZES, at_the_sockets_of)
 }
 
 #[test]
 fn payloads_of_cyclone_dds_equal_those_that_were_sent() -> Result<()> {
-    payloads_are_what_was_sent(Stack::Cyclone, &SIZES, at_the_sockets_of)
+    check_payloads(Stack::Cyclone, &SIZES, at_the_sockets_of)
 }
 
 #[test]
 fn payloads_of_rust_dds_equal_those_that_were_sent() -> Result<()> {
-    payloads_are_what_was_sent(Stack::Rust, &SIZES, at_the_sockets_of)
+    check_payloads(Stack::Rust, &SIZES, at_the_sockets_of)
 }
 
 #[test]
@@ -54,8 +54,8 @@ fn payloads_on_the_wire_equal_those_that_were_sent() -> Result<()> {
     // Samples are in IP fragments, and larger ones in frames of 1.4 KB. A busy machine loses parts
     // of more.
     let on_the_wire = |_: &Namespace| ON_THE_WIRE.to_owned();
-    payloads_are_what_was_sent(Stack::Fast, &[60_000, 644_000], on_the_wire)?;
-    payloads_are_what_was_sent(Stack::Cyclone, &[644_000], on_the_wire)
+    check_payloads(Stack::Fast, &[60_000, 644_000], on_the_wire)?;
+    check_payloads(Stack::Cyclone, &[644_000], on_the_wire)
 }
 
 #[test]
@@ -107,7 +107,7 @@ fn check_first(stack: Stack, source: impl Fn(&Namespace) -> String) -> Result<()
 }
 
 /// Checks the payloads without a configured watch: one stream of samples suffices.
-fn payloads_are_what_was_sent(
+fn check_payloads(
     stack: Stack,
     sizes: &[usize],
     source: impl Fn(&Namespace) -> String,
@@ -134,7 +134,7 @@ fn payloads_are_what_was_sent(
         publisher.start_sending()?;
         let mut received = BTreeMap::new();
         let mut missed = 0;
-        let mut heard = Instant::now();
+        let mut last_item = Instant::now();
         while received.len() as u64 + missed < stream.count {
             let next = match next_within(&mut lines, QUIET) {
                 // The agent may have seen neither the last samples nor a HEARTBEAT after them.
@@ -145,11 +145,11 @@ fn payloads_are_what_was_sent(
                 {
                     break;
                 }
-                Ok(Some(StreamItem::Nothing)) if heard.elapsed() < PATIENCE => continue,
+                Ok(Some(StreamItem::Nothing)) if last_item.elapsed() < PATIENCE => continue,
                 Ok(Some(StreamItem::Nothing)) => Err(anyhow!("no sample")),
                 next => next,
             };
-            heard = Instant::now();
+            last_item = Instant::now();
             let next = next.with_context(|| match observed.agent.scrape() {
                 Ok(page) => format!(
                     "{stack:?} {size}: after {:?} and {missed} missed: {}",
@@ -181,13 +181,13 @@ fn payloads_are_what_was_sent(
             received.keys().all(|number| sent.contains(number)),
             "{sent:?}"
         );
-        all_is_there_or_counted(&observed, received.len(), missed, lossless_metering)?;
+        check_all_or_counted(&observed, received.len(), missed, lossless_metering)?;
     }
     Ok(())
 }
 
 /// Checks that each sample is delivered or reported as missing.
-fn all_is_there_or_counted(
+fn check_all_or_counted(
     observed: &Observed<'_>,
     received: usize,
     missed: u64,
@@ -200,7 +200,12 @@ fn all_is_there_or_counted(
         "{missed} missed: {}",
         page.doubted_jumps()
     );
-    ensure!(received >= 10, "{} of 40: {}", received, page.doubted_jumps());
+    ensure!(
+        received >= 10,
+        "{} of 40: {}",
+        received,
+        page.doubted_jumps()
+    );
     let label = [("topic", "/points")];
     let counted = page.sum("ros2_topic_messages_total", &label);
     let lost = page.sum("ros2_topic_lost_messages_total", &label);
@@ -386,7 +391,9 @@ fn stopped_and_killed_readers_delay_no_other_reader() -> Result<()> {
             killed.0.kill()?;
         }
         match next(&mut lines)?.context("the stream ended")? {
-            StreamItem::Sample(sample, _) => ensure!(sample.sequence_number == number, "{sample:?}"),
+            StreamItem::Sample(sample, _) => {
+                ensure!(sample.sequence_number == number, "{sample:?}")
+            }
             StreamItem::Missed(missed) => bail!("{number}: {missed:?}"),
             StreamItem::Nothing => bail!("{number}: no sample"),
         }

@@ -133,7 +133,8 @@ fn a_topic_of_two_middlewares_with_a_remote_subscriber_has_all_its_sources() -> 
     let directory = tempfile::tempdir()?;
     let agent = start_agent(&link.robot, directory.path())?;
     let streams = Streams::of_two_middlewares();
-    let [mut publisher, mut talker, ..] = streams.start_until_known(&host, &link.monitor, &agent)?;
+    let [mut publisher, mut talker, ..] =
+        streams.start_until_known(&host, &link.monitor, &agent)?;
     for _ in 0..2 {
         publisher.start_sending()?;
         talker.start_sending()?;
@@ -207,7 +208,12 @@ impl Streams {
     }
 
     /// Starts the peers, publishers first, and repeats this until the agent has all endpoints.
-    fn start_until_known(&self, host: &Host<'_>, remote: &Namespace, agent: &Agent<'_>) -> Result<[Peer; 5]> {
+    fn start_until_known(
+        &self,
+        host: &Host<'_>,
+        remote: &Namespace,
+        agent: &Agent<'_>,
+    ) -> Result<[Peer; 5]> {
         for _ in 0..MAX_START_ATTEMPTS {
             let mut peers = [
                 host.launch(Role::Publisher, &self.both)?,

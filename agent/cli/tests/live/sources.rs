@@ -26,7 +26,7 @@ use ros2probe_model::report::snapshot::Snapshot;
 use ros2probe_testing::harness::PREFIX;
 use ros2probe_testing::harness::cgroup::Cgroup;
 use ros2probe_testing::harness::network::Namespace;
-use ros2probe_testing::harness::witness::{WitnessReport, Witness};
+use ros2probe_testing::harness::witness::{Witness, WitnessReport};
 use ros2probe_wire::Expansion;
 
 /// Configuration that watches every topic, including hidden ones.

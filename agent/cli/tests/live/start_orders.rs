@@ -243,7 +243,10 @@ impl<'n> Robot<'n> {
 
     /// Sends a stretch and waits until the subscriber has it.
     fn send(&mut self) -> Result<()> {
-        self.publisher.as_mut().context("no publisher")?.start_sending()?;
+        self.publisher
+            .as_mut()
+            .context("no publisher")?
+            .start_sending()?;
         self.sent += STRETCH;
         let deadline = Instant::now() + PATIENCE;
         let subscriber = self.subscriber.as_ref().context("no subscriber")?;

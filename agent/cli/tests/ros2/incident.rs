@@ -109,8 +109,16 @@ fn plays(host: &Host<'_>, bag: &Path, count: usize) -> Result<()> {
     let mut player = ros2(host, "player", &["bag", "play", &bag, "--delay", "5"])?;
     player.wait(PATIENCE)?;
     let output = |name| fs::read_to_string(host.file(name)).unwrap_or_default();
-    let heard = || output("listener").matches("data: hello").count();
-    let heard_all = wait_until("the listener heard all messages", || Ok(heard() == count));
+    let received_messages = || output("listener").matches("data: hello").count();
+    let heard_all = wait_until("the listener heard all messages", || {
+        Ok(received_messages() == count)
+    });
     drop(listener);
-    heard_all.with_context(|| format!("{} of {count}: {}", heard(), output("player.err")))
+    heard_all.with_context(|| {
+        format!(
+            "{} of {count}: {}",
+            received_messages(),
+            output("player.err")
+        )
+    })
 }

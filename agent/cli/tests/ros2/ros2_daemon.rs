@@ -297,8 +297,8 @@ impl<'r> Sniffer<'r> {
         };
         let words = ["-i", "any", "-n", "-U", "-Z", "root", "-w", &file, filter];
         let enter = robot.host.network.inside();
-        let said = fs::File::create(&errors)?.into();
-        let process = Process::start_with(&enter, "tcpdump", words, said)?;
+        let printed = fs::File::create(&errors)?.into();
+        let process = Process::start_with(&enter, "tcpdump", words, printed)?;
         wait_until("tcpdump listens", || {
             Ok(fs::read_to_string(&errors)?.contains("listening on"))
         })?;

@@ -238,11 +238,11 @@ fn files_above_the_maximum_size_are_refused() {
         &["bag", "info", bag.to_str().unwrap()],
     ] {
         let output = rp().args(arguments).output().unwrap();
-        let said = String::from_utf8_lossy(&output.stderr);
-        assert!(!output.status.success(), "{said}");
+        let printed = String::from_utf8_lossy(&output.stderr);
+        assert!(!output.status.success(), "{printed}");
         assert!(
-            said.contains("MiB") || said.contains("larger") || said.contains("too large"),
-            "{said}"
+            printed.contains("MiB") || printed.contains("larger") || printed.contains("too large"),
+            "{printed}"
         );
     }
 }

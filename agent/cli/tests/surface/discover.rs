@@ -111,7 +111,11 @@ impl Recording {
 }
 
 /// Checks the rules of every conversation.
-fn assert_conversation_rules(session: &Session, recording: &Recording, outgoing: &[(u64, Outgoing)]) {
+fn assert_conversation_rules(
+    session: &Session,
+    recording: &Recording,
+    outgoing: &[(u64, Outgoing)],
+) {
     let (sent, _) = session.cost();
     assert!(sent.packets <= MAX_PACKETS, "{} packets", sent.packets);
     assert_eq!(sent.packets as usize, outgoing.len());
@@ -189,8 +193,8 @@ fn silence_leads_to_one_more_introduction_and_a_goodbye() {
     let mut session = recording.session();
     let outgoing = recording.play(&mut session, &[]);
     assert_conversation_rules(&session, &recording, &outgoing);
-    let said: Vec<_> = outgoing.iter().map(|(_, packet)| packet.what).collect();
-    assert_eq!(said, ["introduction", "introduction", "goodbye"]);
+    let printed: Vec<_> = outgoing.iter().map(|(_, packet)| packet.what).collect();
+    assert_eq!(printed, ["introduction", "introduction", "goodbye"]);
     let (last, _) = outgoing.last().unwrap();
     assert!(*last <= 1_010 * MILLISECOND);
     assert!(!session.was_answered());

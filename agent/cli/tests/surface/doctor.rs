@@ -15,8 +15,8 @@ use serde_json::Value;
 const UNUSED_ADDRESS: &str = "/nonexistent/api.sock";
 
 fn report(output: &Output) -> Value {
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(said, "");
+    let printed = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(printed, "");
     let report: Value = serde_json::from_slice(&output.stdout).unwrap();
     // The exit code agrees with the report.
     let is_problem = report["verdict"] == "problem";
@@ -169,9 +169,9 @@ fn a_missing_agent_or_configuration_is_reported_in_one_line() {
         &["--config", "/nowhere.yaml"],
     ] {
         let output = rp().arg("doctor").args(arguments).output().unwrap();
-        let said = String::from_utf8(output.stderr).unwrap();
+        let printed = String::from_utf8(output.stderr).unwrap();
         assert!(!output.status.success());
-        assert_eq!(said.lines().count(), 1, "{said}");
+        assert_eq!(printed.lines().count(), 1, "{printed}");
         assert!(output.stdout.is_empty());
     }
     let wrong = Path::new(env!("CARGO_MANIFEST_DIR")).join("Cargo.toml");

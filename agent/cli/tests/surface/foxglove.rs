@@ -16,7 +16,7 @@ use ros2probe_model::facts::selection::Depth;
 use ros2probe_testing::local_agent::{self, LocalAgent, call_api, metric};
 use ros2probe_testing::repository;
 use ros2probe_testing::viewer::{
-    Data, ServerMessage, PATIENCE, Refused, SUBPROTOCOLS, Status, Viewer, open,
+    Data, PATIENCE, Refused, SUBPROTOCOLS, ServerMessage, Status, Viewer, open,
 };
 use serde_json::{Value, json};
 use tokio_tungstenite::tungstenite::Message;
@@ -131,7 +131,7 @@ fn a_viewer_gets_the_messages_of_a_capture_as_they_were_sent() {
             // Topics such as `/rosout` have no subscriber.
             ServerMessage::Status(status) if status.id == "no_subscriber" => {}
             ServerMessage::Graph => is_published |= viewer.graph.published.contains_key("/chatter"),
-            news => panic!("{news:?}"),
+            server_message => panic!("{server_message:?}"),
         }
     }
     assert!(
@@ -330,7 +330,7 @@ fn without_a_token_a_viewer_has_the_rights_of_loopback() {
         .wait_for_topics(&["/chatter", "/rp/topics/chatter"])
         .unwrap();
     viewer.subscribe("/chatter").unwrap();
-    let status = viewer.wait_for("a status", |_, news| match news {
+    let status = viewer.wait_for("a status", |_, server_message| match server_message {
         ServerMessage::Status(status) => Some(status.clone()),
         _ => None,
     });
@@ -339,7 +339,7 @@ fn without_a_token_a_viewer_has_the_rights_of_loopback() {
     assert!(message.contains("rp foxglove"), "{message}");
     wait_for_viewers(&agent, 1.0, 0.0);
     let id = viewer.subscribe("/rp/topics/chatter").unwrap();
-    let is_figure = |_: &Viewer, news: &ServerMessage| match news {
+    let is_figure = |_: &Viewer, server_message: &ServerMessage| match server_message {
         ServerMessage::Data(data) => (data.subscription == id).then_some(()),
         _ => None,
     };
@@ -452,7 +452,7 @@ fn clients_that_violate_the_protocol_are_closed_with_a_code_and_use_no_resources
         viewer
             .send(&json!({"op": "subscribe", "subscriptions": entries}))
             .unwrap();
-        let status = viewer.wait_for("a status", |_, news| match news {
+        let status = viewer.wait_for("a status", |_, server_message| match server_message {
             ServerMessage::Status(status) => Some(status.clone()),
             _ => None,
         });
@@ -470,7 +470,7 @@ fn clients_that_violate_the_protocol_are_closed_with_a_code_and_use_no_resources
         .send(&json!({"op": "advertise", "channels": []}))
         .unwrap();
     for what in ["binary messages", "`advertise`"] {
-        let status = viewer.wait_for("a status", |_, news| match news {
+        let status = viewer.wait_for("a status", |_, server_message| match server_message {
             ServerMessage::Status(status) => Some(status.clone()),
             _ => None,
         });

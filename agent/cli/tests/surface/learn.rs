@@ -129,9 +129,12 @@ fn learn(capture: &Path) -> PathBuf {
     let words = ["learn", "--replay", capture.to_str().unwrap(), "-o"];
     let output = run(&[&words[..], &[file.to_str().unwrap()]].concat());
     assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
-    let said = stderr(&output);
-    assert_eq!(said.lines().count(), 1, "{said}");
-    assert!(said.starts_with("rp: expectations for "), "{said}");
+    let output_text = stderr(&output);
+    assert_eq!(output_text.lines().count(), 1, "{output_text}");
+    assert!(
+        output_text.starts_with("rp: expectations for "),
+        "{output_text}"
+    );
     file
 }
 
@@ -292,9 +295,12 @@ fn a_file_is_replaced_only_with_force_and_a_failure_leaves_no_file() {
         let other = directory.path().join("other.yaml");
         let output = other.to_str().unwrap();
         let failed = run(&[&words[..], &["--replay", capture, "-o", output]].concat());
-        let said = stderr(&failed);
-        assert_eq!(failed.status.code(), Some(1), "{said}");
-        assert!(said.contains(part), "`{part}` is not in {said}");
+        let output_text = stderr(&failed);
+        assert_eq!(failed.status.code(), Some(1), "{output_text}");
+        assert!(
+            output_text.contains(part),
+            "`{part}` is not in {output_text}"
+        );
         assert!(!other.exists());
     }
     let missing = directory.path().join("no/such/directory.yaml");

@@ -277,9 +277,9 @@ fn a_token_from_the_socket_grants_the_page_more_access_than_loopback() {
         .arg(&socket)
         .output()
         .unwrap();
-    let said = String::from_utf8(printed.stderr).unwrap();
+    let output_text = String::from_utf8(printed.stderr).unwrap();
     let address = String::from_utf8(printed.stdout).unwrap();
-    assert!(printed.status.success(), "{said}");
+    assert!(printed.status.success(), "{output_text}");
     let (page, token) = address.trim().split_once("#token=").unwrap();
     assert_eq!(page, format!("http://localhost:{}/", agent.api.port()));
     let bearer = format!("Authorization: Bearer {token}\r\n");

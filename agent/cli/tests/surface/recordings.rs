@@ -153,7 +153,10 @@ fn a_recording_that_reaches_a_limit_ends_with_the_reason_and_the_next_is_refused
     let api = agent.api;
     let (_, all) = call_api(api, "GET", "/recordings", "");
     assert_eq!(all["limits"]["max_total_bytes"], 1_000_000, "{all}");
-    assert_eq!(call_api(api, "POST", "/recordings", r#"{"name": "cut"}"#).0, 201);
+    assert_eq!(
+        call_api(api, "POST", "/recordings", r#"{"name": "cut"}"#).0,
+        201
+    );
     wait_for(api, "cut", |recording| {
         recording["report"]["messages"].as_u64() > Some(5)
     });
@@ -366,9 +369,9 @@ fn without_retention_a_late_echo_reports_the_missing_latched_message() {
         &host,
     ];
     let echoed = rp().args(echo).output().unwrap();
-    let said = String::from_utf8(echoed.stderr).unwrap();
+    let printed = String::from_utf8(echoed.stderr).unwrap();
     let missing = "the latched message of /tf_static is not kept: set `retain: last` in a watch";
-    assert!(said.contains(missing), "{said}");
+    assert!(printed.contains(missing), "{printed}");
     assert!(echoed.stdout.is_empty());
 }
 
@@ -403,16 +406,16 @@ fn snapshots_without_a_directory_are_an_error_only_if_the_directory_is_off() {
             .arg(&configuration)
             .output()
             .unwrap();
-        let said = String::from_utf8_lossy(&output.stderr).into_owned();
-        (output.status.code(), output.stdout.len(), said)
+        let printed = String::from_utf8_lossy(&output.stderr).into_owned();
+        (output.status.code(), output.stdout.len(), printed)
     };
     // A replay has no state directory, like an agent whose disk is missing.
-    let (code, length, said) = run("");
-    assert_eq!(code, Some(0), "{said}");
-    assert!(length > 1000 && said.contains("snapshots are disabled"));
-    let (code, _, said) = run("state_directory: off\n");
-    assert_eq!(code, Some(1), "{said}");
-    assert!(said.contains("the agent has no directory for recordings"));
+    let (code, length, printed) = run("");
+    assert_eq!(code, Some(0), "{printed}");
+    assert!(length > 1000 && printed.contains("snapshots are disabled"));
+    let (code, _, printed) = run("state_directory: off\n");
+    assert_eq!(code, Some(1), "{printed}");
+    assert!(printed.contains("the agent has no directory for recordings"));
 }
 
 /// Converts a capture. Returns the exit code of `rp bag convert`, its standard error, and the
@@ -426,12 +429,12 @@ fn converted(capture: &Path, bag: &Path, options: &[&str]) -> (Option<i32>, Stri
     command.env_remove("ROS_DISTRO").env_remove("ROS_DOMAIN_ID");
     let output = command.stdin(Stdio::null()).output().unwrap();
     assert!(output.stdout.is_empty(), "{output:?}");
-    let said = String::from_utf8(output.stderr).unwrap();
+    let printed = String::from_utf8(output.stderr).unwrap();
     let metadata = std::fs::read_to_string(bag.join("metadata.yaml")).unwrap_or_default();
     let metadata = ros2probe_bag::metadata::Metadata::read(&metadata).ok();
     let report = metadata.and_then(|mut metadata| metadata.custom_data.remove("ros2probe"));
     let report = report.map(|report| serde_json::from_str(&report).unwrap());
-    (output.status.code(), said, report.unwrap_or_default())
+    (output.status.code(), printed, report.unwrap_or_default())
 }
 
 /// Writes a capture of one minute with `MANY` topics, each with one message per second.
@@ -461,7 +464,7 @@ fn many_topics(path: &Path) {
 struct Recording {
     child: Child,
     lines: Receiver<String>,
-    said: Vec<String>,
+    printed: Vec<String>,
 }
 
 impl Recording {
@@ -485,7 +488,7 @@ impl Recording {
         Self {
             child,
             lines,
-            said: Vec::new(),
+            printed: Vec::new(),
         }
     }
 
@@ -495,10 +498,10 @@ impl Recording {
         loop {
             let left = PATIENCE.saturating_sub(begun.elapsed());
             let Ok(line) = self.lines.recv_timeout(left) else {
-                panic!("no `{text}` in {:#?}", self.said);
+                panic!("no `{text}` in {:#?}", self.printed);
             };
-            self.said.push(line);
-            if self.said.last().unwrap().contains(text) {
+            self.printed.push(line);
+            if self.printed.last().unwrap().contains(text) {
                 return begun.elapsed();
             }
         }
@@ -517,10 +520,10 @@ impl Recording {
             if let Some(status) = self.child.try_wait().unwrap() {
                 break status;
             }
-            assert!(begun.elapsed() < PATIENCE, "{:#?}", self.said);
+            assert!(begun.elapsed() < PATIENCE, "{:#?}", self.printed);
             std::thread::sleep(Duration::from_millis(20));
         };
-        self.said.extend(self.lines.iter());
+        self.printed.extend(self.lines.iter());
         (status, begun.elapsed())
     }
 }

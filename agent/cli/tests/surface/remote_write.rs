@@ -76,8 +76,8 @@ fn is_constant(labels: &Labels) -> bool {
     !changes(name) && !name.starts_with("ros2probe_remote_write_") && name != "up"
 }
 
-/// Asserts that the last samples are those of the page. A figure may change between the two, so that
-/// the next samples count, too.
+/// Asserts that the last samples are those of the page. A figure may change between the two, so
+/// that the next samples count, too.
 fn assert_same_as_page(receiver: &Receiver, agent: &LocalAgent) {
     let mut difference = String::new();
     for _ in 0..5 {
@@ -159,7 +159,7 @@ fn a_receiver_of_version_1_gets_the_same_series() {
 }
 
 #[test]
-fn samples_that_a_receiver_cannot_store_yet_come_later_in_order_and_once() {
+fn samples_refused_temporarily_are_sent_later_in_order_and_once() {
     let directory = tempfile::tempdir().unwrap();
     let mut answers = [500, 429, 401, 503].into_iter();
     let receiver = Receiver::start(move |write| match answers.next() {

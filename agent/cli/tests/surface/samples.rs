@@ -78,11 +78,11 @@ pub(crate) fn replayed(capture: &Path, depth: Option<Depth>) -> (Snapshot, Vec<S
     }
     let mut reader = PcapReader::open(capture, Expansion::Limited).unwrap();
     let mut feed = FrameDecoder::new(Limits::default());
-    let mut news = Vec::new();
+    let mut outcomes = Vec::new();
     let mut take = |observer: &mut Observer| {
         for given in observer.drain().samples {
             assert_eq!(*given.to, [1]);
-            news.push(given.outcome);
+            outcomes.push(given.outcome);
         }
     };
     while let Some(captured) = reader.next_packet().unwrap() {
@@ -97,17 +97,17 @@ pub(crate) fn replayed(capture: &Path, depth: Option<Depth>) -> (Snapshot, Vec<S
     for topic in &mut snapshot.topics {
         topic.is_read = false;
     }
-    (snapshot, news)
+    (snapshot, outcomes)
 }
 
 /// Returns the numbers of samples and bytes by topic. Each sample must be unique, and the times
 /// must not decrease, except by some nanoseconds.
-fn counts(news: &[SampleOutcome], depth: Depth) -> BTreeMap<(DomainId, String), (u64, u64)> {
+fn counts(outcomes: &[SampleOutcome], depth: Depth) -> BTreeMap<(DomainId, String), (u64, u64)> {
     let mut counts: BTreeMap<_, (u64, u64)> = BTreeMap::new();
     let mut seen = BTreeSet::new();
     let mut last = 0;
-    for news in news {
-        let SampleOutcome::Sample(sample) = news else {
+    for outcome in outcomes {
+        let SampleOutcome::Sample(sample) = outcome else {
             continue;
         };
         assert!(seen.insert((sample.writer, sample.sequence_number)));
@@ -125,8 +125,8 @@ fn counts(news: &[SampleOutcome], depth: Depth) -> BTreeMap<(DomainId, String), 
     counts
 }
 
-fn unannounced(news: &[SampleOutcome], dds_name: &str) -> u64 {
-    let missed = news.iter().filter_map(|news| match news {
+fn unannounced(outcomes: &[SampleOutcome], dds_name: &str) -> u64 {
+    let missed = outcomes.iter().filter_map(|outcome| match outcome {
         SampleOutcome::Missed(missed) if missed.reason == MissedReason::Unannounced => Some(missed),
         _ => None,
     });
@@ -148,10 +148,10 @@ fn a_sample_request_changes_no_count_and_gets_each_counted_sample_once() {
             if depth == Depth::Payloads && is_cut(&alone) {
                 continue;
             }
-            let (with, news) = replayed(&capture, Some(depth));
+            let (with, outcomes) = replayed(&capture, Some(depth));
             let name = capture.display();
             assert_eq!(format!("{alone:?}"), format!("{with:?}"), "{name}");
-            let mut counts = counts(&news, depth);
+            let mut counts = counts(&outcomes, depth);
             let (mut incomplete, mut lost) = (0, 0);
             for topic in &with.topics {
                 let Some(measured) = &topic.measurement else {
@@ -160,7 +160,7 @@ fn a_sample_request_changes_no_count_and_gets_each_counted_sample_once() {
                 let key = (topic.domain_id, topic.dds_name.to_string());
                 let given = counts.remove(&key).unwrap_or_default();
                 // Earlier samples of an unknown writer count for its topic after its announcement.
-                let unannounced = unannounced(&news, &key.1);
+                let unannounced = unannounced(&outcomes, &key.1);
                 assert_eq!(given.0 + unannounced, measured.messages, "{name}: {key:?}");
                 if unannounced == 0 {
                     assert_eq!(given.1, measured.bytes, "{name}: {key:?}");
@@ -170,7 +170,7 @@ fn a_sample_request_changes_no_count_and_gets_each_counted_sample_once() {
                 lost += measured.lost;
             }
             assert!(counts.is_empty(), "{name}: {counts:?}");
-            let missed = news.iter().filter_map(|news| match news {
+            let missed = outcomes.iter().filter_map(|outcome| match outcome {
                 SampleOutcome::Missed(missed) => Some((missed.reason, missed.samples)),
                 SampleOutcome::Sample(_) => None,
             });
@@ -218,8 +218,8 @@ fn a_subscription_gets_the_messages_of_a_reliable_subscriber_in_order_and_on_tim
         let capture = directory.join("capture.pcap.gz");
         for depth in [Depth::Arrivals, Depth::Payloads] {
             let (mut given, mut lost, mut early) = (Vec::new(), BTreeSet::new(), 0);
-            for news in replayed(&capture, Some(depth)).1 {
-                match news {
+            for outcome in replayed(&capture, Some(depth)).1 {
+                match outcome {
                     SampleOutcome::Sample(sample) if &*sample.topic.name == "/chatter" => {
                         given.push((sample.sequence_number - SequenceNumber(1), sample.time.0));
                     }

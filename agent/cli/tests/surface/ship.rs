@@ -10,7 +10,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use crate::rp;
 use ros2probe_bag::{Options, TopicDescription, Writer};
-use ros2probe_testing::s3::{BUCKET, Call, RequestOutcome, Operation, Store, hex};
+use ros2probe_testing::s3::{BUCKET, Call, Operation, RequestOutcome, Store, hex};
 use ros2probe_wire::Timestamp;
 use serde_json::{Value, json};
 use tempfile::TempDir;
@@ -410,7 +410,7 @@ fn a_store_that_refuses_and_cuts_has_each_bag_once_in_the_end() {
 }
 
 #[test]
-fn a_store_out_of_reach_is_reported_and_nothing_is_lost() {
+fn an_unreachable_store_is_reported_and_no_bag_is_lost() {
     let store = Store::start();
     let robot = Robot::of(&store);
     robot.record("drive", 1000, 100);
@@ -477,7 +477,11 @@ fn an_upload_whose_completion_was_not_confirmed_is_not_repeated() {
     store.decide(move |call| {
         let cuts = call.operation == Operation::Complete && !is_cut;
         is_cut |= cuts;
-        if cuts { RequestOutcome::CutAnswer } else { RequestOutcome::Serve }
+        if cuts {
+            RequestOutcome::CutAnswer
+        } else {
+            RequestOutcome::Serve
+        }
     });
     robot.record("drive", 12 * MIB, 100);
     robot.delivers();

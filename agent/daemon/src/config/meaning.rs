@@ -518,9 +518,9 @@ pub(super) enum InvalidText {
 pub(super) fn check_text(key: &str, text: &str) -> Result<(), InvalidText> {
     match without_indices(key).as_str() {
         "watch[]" | "watch[].topic" | "recordings.snapshots[].topics[]" => Ok(check_pattern(text)?),
-        "chains[].from" | "chains[].to" if text.contains('*') => {
-            Err(InvalidText::Unsuitable("the name of one topic, as in `/points`"))
-        }
+        "chains[].from" | "chains[].to" if text.contains('*') => Err(InvalidText::Unsuitable(
+            "the name of one topic, as in `/points`",
+        )),
         "chains[].from" | "chains[].to" => Ok(check_pattern(text)?),
         "capture.interfaces.include[]"
         | "capture.interfaces.exclude[]"
@@ -613,15 +613,19 @@ pub(super) fn check_text(key: &str, text: &str) -> Result<(), InvalidText> {
             let text = text.to_owned();
             Err(InvalidText::Address { text, port })
         }
-        "otlp.endpoint" if text != "off" && otlp_endpoint(text).is_none() => Err(
-            InvalidText::Unsuitable("the URL of a receiver, as in `http://collector:4317`, or `off`"),
-        ),
+        "otlp.endpoint" if text != "off" && otlp_endpoint(text).is_none() => {
+            Err(InvalidText::Unsuitable(
+                "the URL of a receiver, as in `http://collector:4317`, or `off`",
+            ))
+        }
         "otlp.headers_file" if !text.starts_with('/') => {
             Err(InvalidText::RelativePath("`/etc/ros2probe/otlp.headers`"))
         }
-        "remote_write.url" if remote_write::receiver(text).is_none() => Err(InvalidText::Unsuitable(
-            "the URL of a receiver, as in `https://prometheus.example/api/v1/write`",
-        )),
+        "remote_write.url" if remote_write::receiver(text).is_none() => {
+            Err(InvalidText::Unsuitable(
+                "the URL of a receiver, as in `https://prometheus.example/api/v1/write`",
+            ))
+        }
         "remote_write.token_file"
         | "remote_write.ca_file"
         | "remote_write.certificate_file"
@@ -706,7 +710,8 @@ fn without_indices(key: &str) -> String {
     key.chars().filter(|c| shown(*c)).collect()
 }
 
-/// Returns the settings of a delivery; texts that are no windows are reported by the check of texts.
+/// Returns the settings of a delivery; texts that are no windows are reported by the check of
+/// texts.
 fn ship(shape: ShipShape) -> ShipSettings {
     let windows = shape.windows.unwrap_or_default();
     let windows = windows.iter().filter_map(|text| text.parse().ok());

@@ -484,12 +484,12 @@ fn finding(finding: &Diagnosis) -> Values {
             domain_id,
             node,
             errors,
-            text: said,
+            text: log_text,
         } => vec![
             ("domain_id", number(*domain_id)),
             ("ros_node", Some(text(node))),
             ("log_errors", number(*errors)),
-            ("log_text", Some(text(said))),
+            ("log_text", Some(text(log_text))),
         ],
         Diagnosis::DiagnosticError {
             domain_id,

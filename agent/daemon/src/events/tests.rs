@@ -118,7 +118,10 @@ fn a_burst_is_limited_each_second_and_summarized_in_one_event() {
     more.overflow = vec![(Class::Endpoint, 9)];
     log.add(more, second(1));
     let batch = log.read(0, KeptEvents::CAP);
-    assert_eq!(batch.records.len() as u64, u64::from(MAX_EVENTS_PER_SECOND) + 1);
+    assert_eq!(
+        batch.records.len() as u64,
+        u64::from(MAX_EVENTS_PER_SECOND) + 1
+    );
     assert_eq!(names(&batch).last(), Some(&"ros2.topic.silent"));
     log.add(Taken::default(), second(1));
     assert_eq!(log.last(), batch.last);
@@ -130,13 +133,13 @@ fn a_burst_is_limited_each_second_and_summarized_in_one_event() {
         names(&rest),
         [suppressed, suppressed, "ros2.node.discovered"]
     );
-    let said: Vec<_> = rest.records[..2]
+    let recorded: Vec<_> = rest.records[..2]
         .iter()
         .map(|record| record.attributes.clone())
         .collect();
     let text = |text: &str| Value::Text(text.to_owned());
     assert_eq!(
-        said,
+        recorded,
         [
             [
                 ("event", text("ros2.endpoint.*")),
@@ -150,7 +153,10 @@ fn a_burst_is_limited_each_second_and_summarized_in_one_event() {
     );
     assert_eq!(log.dropped()[0], ("storm", 60));
     let recorded: BTreeMap<_, _> = log.recorded().into_iter().collect();
-    assert_eq!(recorded["ros2.node.discovered"], u64::from(MAX_EVENTS_PER_SECOND) + 1);
+    assert_eq!(
+        recorded["ros2.node.discovered"],
+        u64::from(MAX_EVENTS_PER_SECOND) + 1
+    );
     assert_eq!(
         (recorded[suppressed], recorded["ros2.message.lost"]),
         (2, 0)

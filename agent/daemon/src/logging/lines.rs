@@ -74,7 +74,11 @@ impl<W: Write + AsFd> Lines<W> {
     }
 
     fn wait_writable(&self) -> io::Result<()> {
-        let timeout = if self.is_blocked { NO_WAIT } else { READER_TIMEOUT };
+        let timeout = if self.is_blocked {
+            NO_WAIT
+        } else {
+            READER_TIMEOUT
+        };
         let mut target = [PollFd::new(&self.target, PollFlags::OUT)];
         // A descriptor after a hangup is ready, too; the write then fails.
         match poll(&mut target, Some(&timeout)) {

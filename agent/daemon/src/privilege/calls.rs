@@ -265,13 +265,20 @@ impl Allowed {
                 allowed.end_perf_events()?;
             }
             Role::Reattach { .. } => {
-                allowed.allow(READ_METADATA).allow(INOTIFY_CALLS).open_for_reading()?;
+                allowed
+                    .allow(READ_METADATA)
+                    .allow(INOTIFY_CALLS)
+                    .open_for_reading()?;
                 allowed.bpf([command::LINK_CREATE].into_iter())?;
             }
             Role::SharedMemory { .. } => {
-                allowed.allow(READ_METADATA).allow(INOTIFY_CALLS).open_for_reading()?;
+                allowed
+                    .allow(READ_METADATA)
+                    .allow(INOTIFY_CALLS)
+                    .open_for_reading()?;
                 for policy in [libc::SCHED_FIFO, libc::SCHED_OTHER] {
-                    allowed.allow_if(libc::SYS_sched_setscheduler, &[argument_equals(1, policy)?])?;
+                    allowed
+                        .allow_if(libc::SYS_sched_setscheduler, &[argument_equals(1, policy)?])?;
                 }
             }
             Role::Exact => {
@@ -326,7 +333,10 @@ impl Allowed {
             libc::SYS_fork,
         ]);
         self.bpf([command::LINK_CREATE].into_iter())?;
-        self.allow_if(libc::SYS_prctl, &[argument_equals(0, libc::PR_SET_PDEATHSIG)?])?;
+        self.allow_if(
+            libc::SYS_prctl,
+            &[argument_equals(0, libc::PR_SET_PDEATHSIG)?],
+        )?;
         for request in [request::PERF_ENABLE, request::PERF_SET_BPF] {
             self.allow_if(libc::SYS_ioctl, &[argument_equals(1, request)?])?;
         }
@@ -341,7 +351,11 @@ impl Allowed {
     }
 
     /// Allows `call` if all `conditions` hold.
-    fn allow_if(&mut self, call: c_long, conditions: &[SeccompCondition]) -> Result<(), BackendError> {
+    fn allow_if(
+        &mut self,
+        call: c_long,
+        conditions: &[SeccompCondition],
+    ) -> Result<(), BackendError> {
         let rule = SeccompRule::new(conditions.to_vec())?;
         self.0.entry(call).or_default().push(rule);
         Ok(())
@@ -363,7 +377,10 @@ impl Allowed {
             self.allow_if(libc::SYS_prctl, &[argument_equals(0, option)?])?;
         }
         let is_set = argument_equals(1, libc::PR_CAP_AMBIENT_IS_SET)?;
-        self.allow_if(libc::SYS_prctl, &[argument_equals(0, libc::PR_CAP_AMBIENT)?, is_set])?;
+        self.allow_if(
+            libc::SYS_prctl,
+            &[argument_equals(0, libc::PR_CAP_AMBIENT)?, is_set],
+        )?;
         // Any thread may handle a signal, and notifies the runtime through an open socket.
         self.allow_if(libc::SYS_sendto, &[condition(4, SeccompCmpOp::Eq, 0)?])?;
         // Resource limits are only read.
@@ -402,7 +419,8 @@ impl Allowed {
     fn socket(&mut self, family: i32, kind: i32) -> Result<(), BackendError> {
         let flags = libc::SOCK_CLOEXEC | libc::SOCK_NONBLOCK;
         let of_kind = SeccompCmpOp::MaskedEq(!sign_extended(flags) & u64::from(u32::MAX));
-        let of_kind = SeccompCondition::new(1, SeccompCmpArgLen::Dword, of_kind, sign_extended(kind))?;
+        let of_kind =
+            SeccompCondition::new(1, SeccompCmpArgLen::Dword, of_kind, sign_extended(kind))?;
         self.allow_if(libc::SYS_socket, &[argument_equals(0, family)?, of_kind])
     }
 
@@ -423,7 +441,10 @@ impl Allowed {
 
     /// Allows detaching tracepoints and probes.
     fn end_perf_events(&mut self) -> Result<(), BackendError> {
-        self.allow_if(libc::SYS_ioctl, &[argument_equals(1, request::PERF_DISABLE)?])
+        self.allow_if(
+            libc::SYS_ioctl,
+            &[argument_equals(1, request::PERF_DISABLE)?],
+        )
     }
 }
 

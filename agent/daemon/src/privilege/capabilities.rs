@@ -234,8 +234,8 @@ impl Missing {
         format!("sudo setcap {}+ep {program}", grant.join(","))
     }
 
-    /// Returns what grants the capabilities of the first possible source to a container, or why this
-    /// process does not have those of its container.
+    /// Returns what grants the capabilities of the first possible source to a container, or why
+    /// this process does not have those of its container.
     #[must_use]
     pub fn in_container(&self) -> String {
         let withheld = |one| capability_is_in_bounding_set(one).unwrap_or(false);
@@ -336,8 +336,14 @@ mod tests {
     fn three_capabilities_are_enough_for_either_source() {
         let nothing: [Vec<CapabilitySet>; 0] = [];
         let auto = settings(SourceChoice::Auto);
-        assert_eq!(lacks(&HOST_CAPABILITIES, &settings(SourceChoice::Host)), nothing);
-        assert_eq!(lacks(&WIRE_CAPABILITIES, &settings(SourceChoice::Wire)), nothing);
+        assert_eq!(
+            lacks(&HOST_CAPABILITIES, &settings(SourceChoice::Host)),
+            nothing
+        );
+        assert_eq!(
+            lacks(&WIRE_CAPABILITIES, &settings(SourceChoice::Wire)),
+            nothing
+        );
         assert_eq!(lacks(&HOST_CAPABILITIES, &auto), nothing);
         assert_eq!(lacks(&WIRE_CAPABILITIES, &auto), nothing);
         assert_eq!(lacks(&[], &auto), [HOST_CAPABILITIES, WIRE_CAPABILITIES]);
@@ -369,17 +375,26 @@ mod tests {
             include_interfaces: vec!["eth0".to_owned()],
             ..settings(SourceChoice::Auto)
         };
-        assert_eq!(lacks(&HOST_CAPABILITIES, &named), [[CapabilitySet::NET_RAW]]);
+        assert_eq!(
+            lacks(&HOST_CAPABILITIES, &named),
+            [[CapabilitySet::NET_RAW]]
+        );
         let mirroring = CaptureSettings {
             mirror_interfaces: vec!["mirror0".to_owned()],
             ..settings(SourceChoice::Host)
         };
-        assert_eq!(lacks(&HOST_CAPABILITIES, &mirroring), [[CapabilitySet::NET_RAW]]);
+        assert_eq!(
+            lacks(&HOST_CAPABILITIES, &mirroring),
+            [[CapabilitySet::NET_RAW]]
+        );
         let entering = CaptureSettings {
             network_namespaces: vec![PathBuf::from("/run/netns/a")],
             ..settings(SourceChoice::Wire)
         };
-        assert_eq!(lacks(&WIRE_CAPABILITIES, &entering), [[CapabilitySet::SYS_ADMIN]]);
+        assert_eq!(
+            lacks(&WIRE_CAPABILITIES, &entering),
+            [[CapabilitySet::SYS_ADMIN]]
+        );
         let old = [CapabilitySet::NET_RAW, CapabilitySet::SYS_ADMIN];
         assert!(lacks(&old, &entering).is_empty());
     }
@@ -418,7 +433,8 @@ mod tests {
              `AmbientCapabilities=CAP_NET_ADMIN CAP_BPF CAP_PERFMON` and \
              `CapabilityBoundingSet=CAP_NET_ADMIN CAP_BPF CAP_PERFMON` (`systemctl edit`)"
         );
-        let missing = super::missing(set(&WIRE_CAPABILITIES[1..]), &settings(SourceChoice::Wire)).unwrap();
+        let missing =
+            super::missing(set(&WIRE_CAPABILITIES[1..]), &settings(SourceChoice::Wire)).unwrap();
         assert_eq!(
             missing.in_unit(),
             "live capture needs CAP_NET_RAW for the source `wire`: the unit needs \

@@ -70,8 +70,9 @@ pub enum Role {
         /// Whether the kernel requires `CAP_BPF`, as [`Role::inside`] determines.
         needs_bpf: bool,
     },
-    /// The broker, a process of its own with the capabilities that [`uprobe::usable_capabilities`] returns. It
-    /// forks, accepts connections, and opens files for reading, but creates no connection.
+    /// The broker, a process of its own with the capabilities that [`uprobe::usable_capabilities`]
+    /// returns. It forks, accepts connections, and opens files for reading, but creates no
+    /// connection.
     Broker,
 }
 

@@ -117,7 +117,8 @@ impl Filter {
         &self.options
     }
 
-    /// Returns the topics to subscribe to: all that [`Self::is_selected`] may accept, and a few others.
+    /// Returns the topics to subscribe to: all that [`Self::is_selected`] may accept, and a few
+    /// others.
     ///
     /// # Errors
     ///

@@ -201,7 +201,8 @@ impl<'a> Recorder<'a> {
     #[must_use]
     pub fn unobserved_topics(&self, graph: &GraphSnapshot) -> BTreeMap<String, String> {
         let topics = graph.topics.iter();
-        let topics = topics.filter(|topic| topic.domain_id == self.domain_id && self.is_selected(topic));
+        let topics =
+            topics.filter(|topic| topic.domain_id == self.domain_id && self.is_selected(topic));
         let topics = topics.filter_map(|topic| {
             let recorded = self.report.topics.get(&topic.name);
             if recorded.is_some_and(|topic| topic.messages > 0 || topic.paused > 0) {

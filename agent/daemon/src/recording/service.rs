@@ -408,8 +408,8 @@ impl Recordings {
         }
     }
 
-    /// Returns whether a bag may be removed for another one: if bags are delivered, only a delivered
-    /// one.
+    /// Returns whether a bag may be removed for another one: if bags are delivered, only a
+    /// delivered one.
     pub(super) fn may_remove(&self, bag: &Path) -> bool {
         let receipts = self.receipts.as_deref();
         receipts.is_none_or(|state| ros2probe_ship::is_delivered(state, bag))

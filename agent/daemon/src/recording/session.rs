@@ -81,8 +81,8 @@ struct Completion<'a, T> {
 }
 
 /// Records until the end. The second value is the source's error, if it failed. `report_activity`
-/// is called regularly and after each command. `is_behind` returns whether items wait that `next` has
-/// already received: they are recorded before the end, however long it takes.
+/// is called regularly and after each command. `is_behind` returns whether items wait that `next`
+/// has already received: they are recorded before the end, however long it takes.
 pub fn record<E>(
     mut recorder: Recorder<'_>,
     mut next: impl FnMut(Duration) -> Result<NextItem, E>,
@@ -92,7 +92,7 @@ pub fn record<E>(
 ) -> (Finished, Option<E>) {
     let mut compressing = Compressing::default();
     let mut stopping: Option<(Timestamp, Instant)> = None;
-    let mut hurry = false;
+    let mut abort = false;
     let mut reported = Instant::now();
     report_activity(Activity::Recording(&recorder));
     let (refused, broke) = loop {
@@ -106,7 +106,7 @@ pub fn record<E>(
                 }
             }
             Ok(CommandOutcome::Abort) => {
-                hurry = true;
+                abort = true;
                 break (None, None);
             }
             Err(error) => break (Some(error), None),
@@ -144,7 +144,7 @@ pub fn record<E>(
         commands,
         report_activity,
         reported: Instant::now(),
-        is_aborted: hurry,
+        is_aborted: abort,
     };
     let compressed = compressing.finish(&mut recorder, &mut completion);
     let refused = refused.or(compressed.err());

@@ -146,7 +146,10 @@ impl Run {
     /// Saves the discovery state for the next start.
     #[must_use]
     pub fn with_state_writer(self, keeper: Option<StateWriter>) -> Self {
-        Self { state_writer: keeper, ..self }
+        Self {
+            state_writer: keeper,
+            ..self
+        }
     }
 
     /// Keeps the measurements of the last seconds.
@@ -321,8 +324,8 @@ impl Run {
         }
     }
 
-    /// Passes new items to the outputs. Slow readers block this thread only during a replay. Returns
-    /// whether an event other than of a participant or endpoint is among them.
+    /// Passes new items to the outputs. Slow readers block this thread only during a replay.
+    /// Returns whether an event other than of a participant or endpoint is among them.
     fn hand_over(&mut self) -> bool {
         let now = self.source.clock();
         let output = self.observer.drain();
@@ -389,7 +392,8 @@ impl Run {
     fn confirm_requests(&mut self) {
         if let Some(sample_requests) = self.sample_requests.take() {
             let observer = &mut self.observer;
-            (self.subscriptions).confirm_applied(&sample_requests, |request| observer.latched(request));
+            (self.subscriptions)
+                .confirm_applied(&sample_requests, |request| observer.latched(request));
             self.unconfirmed = Some((Arc::clone(&sample_requests), Instant::now()));
             if sample_requests.is_empty() {
                 // Buffers of large messages are free now, and the next subscription may begin much

@@ -391,8 +391,9 @@ impl Replay {
     pub fn reached_pause(&self) -> bool {
         let time = self.waiting.as_ref().map(|waiting| waiting.time);
         let beginning = self.began.unwrap_or_default();
-        time.zip(self.pause.as_ref())
-            .is_some_and(|(time, pause)| pause.is_at_or_after(time, beginning) && !pause.is_reported)
+        time.zip(self.pause.as_ref()).is_some_and(|(time, pause)| {
+            pause.is_at_or_after(time, beginning) && !pause.is_reported
+        })
     }
 
     /// Returns whether the replay is paused and the pause was reported.

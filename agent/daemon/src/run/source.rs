@@ -332,7 +332,7 @@ fn inside(live: &LiveSource) -> Option<InsideSourceFacts> {
         processes: library.processes as u64,
         refused: library.refused,
     });
-    let resting = || facts.is_idle.then(|| INSIDE_IDLE.to_owned());
+    let idle = || facts.is_idle.then(|| INSIDE_IDLE.to_owned());
     let reason_off = facts.detached.or_else(|| stalled(live, Part::Inside));
     Some(InsideSourceFacts {
         mode: match (facts.is_on_demand, facts.has_callbacks) {
@@ -347,7 +347,7 @@ fn inside(live: &LiveSource) -> Option<InsideSourceFacts> {
         late: facts.late,
         without_events: facts.without_events,
         without_deliveries: facts.without_deliveries,
-        reason_off: reason_off.or_else(resting),
+        reason_off: reason_off.or_else(idle),
     })
 }
 

@@ -192,9 +192,9 @@ fn a_pipe_or_directory_instead_of_a_state_file_does_not_block_the_start() {
     let (place, directory) = directory();
     let path = place.path().join(STATE_FILE);
     mknodat(CWD, &path, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0).unwrap();
-    let (found, heard) = std::sync::mpsc::channel();
+    let (found, received) = std::sync::mpsc::channel();
     std::thread::spawn(move || found.send((unusable(&directory), directory)));
-    let (reason, directory) = heard.recv_timeout(Duration::from_secs(10)).unwrap();
+    let (reason, directory) = received.recv_timeout(Duration::from_secs(10)).unwrap();
     assert_eq!(reason, "not a regular file");
     let aside = place.path().join("discovery.json.corrupt");
     let error = StateDirectory::open(&aside).unwrap_err();
@@ -228,12 +228,18 @@ fn a_failed_write_of_the_state_is_counted_and_retried() {
         std::thread::yield_now();
     }
     fs::remove_dir(obstacle).unwrap();
-    assert!(!keeper.is_write_due(0, start + 2 * WRITE_INTERVAL), "nothing has changed");
+    assert!(
+        !keeper.is_write_due(0, start + 2 * WRITE_INTERVAL),
+        "nothing has changed"
+    );
     assert!(
         keeper.is_write_due(0, start + RETRY_INTERVAL),
         "there may be room again"
     );
-    assert!(!keeper.is_write_due(1, start + WRITE_INTERVAL / 2), "it is too soon");
+    assert!(
+        !keeper.is_write_due(1, start + WRITE_INTERVAL / 2),
+        "it is too soon"
+    );
     assert!(keeper.is_write_due(1, start + WRITE_INTERVAL));
     assert_eq!(keeper.facts().writes, 0);
     keeper.finish(Memory::default());

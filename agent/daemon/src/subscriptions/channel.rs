@@ -155,8 +155,8 @@ impl Channel {
         }
     }
 
-    /// Removes and returns the topics whose retained samples are due, if `wait_applied` is the latest
-    /// selection.
+    /// Removes and returns the topics whose retained samples are due, if `wait_applied` is the
+    /// latest selection.
     pub(super) fn take_newly_selected(&self, in_force: &Arc<Selection>) -> Option<Arc<Selection>> {
         let mut wanted = self.wanted();
         let is_latest = Arc::ptr_eq(&wanted.selection, in_force);

@@ -278,8 +278,8 @@ impl Subscriptions {
         }
     }
 
-    /// Marks these requests as in force. The capture thread calls this once it captures every message
-    /// for them.
+    /// Marks these requests as in force. The capture thread calls this once it captures every
+    /// message for them.
     pub fn confirm(&self, sample_requests: &[SampleRequest]) {
         for channel in self.channels.load().iter() {
             if sample_requests
@@ -392,7 +392,9 @@ impl Subscriptions {
     }
 
     fn lock_channels(&self) -> std::sync::MutexGuard<'_, Opened> {
-        self.channels_lock.lock().unwrap_or_else(PoisonError::into_inner)
+        self.channels_lock
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
     }
 }
 

@@ -38,7 +38,10 @@ mod tests {
         let [request] = &sample_requests(&watches)[..] else {
             panic!("one watch asks")
         };
-        assert_eq!((request.id, request.depth), (FIRST_REQUEST_ID, Depth::Payloads));
+        assert_eq!(
+            (request.id, request.depth),
+            (FIRST_REQUEST_ID, Depth::Payloads)
+        );
         assert!(request.selection.globs().eq(["/maps/**"]));
     }
 }

@@ -19,7 +19,7 @@ use crate::snapshot_cell::State;
 use ros2probe_metrics::catalogue as metric;
 use ros2probe_metrics::metric_sink::{Label, MetricSink};
 use ros2probe_metrics::otlp::{Exports, Outcome, Reason};
-use ros2probe_metrics::remote_write::{SampleFate, Figures, Request};
+use ros2probe_metrics::remote_write::{Figures, Request, SampleFate};
 use ros2probe_model::facts::dispatch::MissedReason;
 
 /// Writes the version, source, sandbox, abilities and readiness of the agent.

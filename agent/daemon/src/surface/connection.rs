@@ -26,8 +26,8 @@ const PROGRESS_TIMEOUT: Duration = Duration::from_secs(10);
 const MIN_PROGRESS_BYTES: usize = 64 << 10;
 /// An agent that acts this late after a deadline had no CPU time.
 const MAX_TIMER_DELAY: Duration = Duration::from_secs(1);
-/// Maximum number of bytes of unfinished requests per listener, in addition to [`UNCHARGED_BYTES`] per
-/// connection.
+/// Maximum number of bytes of unfinished requests per listener, in addition to [`UNCHARGED_BYTES`]
+/// per connection.
 const MAX_UNFINISHED_BYTES: usize = 256 << 10;
 /// Number of bytes of an unfinished request that every connection may use.
 const UNCHARGED_BYTES: usize = 4 << 10;

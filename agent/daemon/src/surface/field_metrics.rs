@@ -70,7 +70,8 @@ struct Found {
 impl Found {
     /// Returns whether a further search would have the same result, at this revision.
     fn is_valid(&self, revision: u64) -> bool {
-        self.message_type.is_ok() || (self.revision == revision && self.at.elapsed() < SEARCH_INTERVAL)
+        self.message_type.is_ok()
+            || (self.revision == revision && self.at.elapsed() < SEARCH_INTERVAL)
     }
 }
 

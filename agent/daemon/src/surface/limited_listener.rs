@@ -140,7 +140,11 @@ impl Refusal {
         stream.write_all(self.0.as_bytes()).await?;
         stream.shutdown().await?;
         // Closing with unread data would reset the connection and might lose the answer.
-        tokio::io::copy(&mut stream.take(MAX_REFUSED_REQUEST), &mut tokio::io::sink()).await?;
+        tokio::io::copy(
+            &mut stream.take(MAX_REFUSED_REQUEST),
+            &mut tokio::io::sink(),
+        )
+        .await?;
         Ok(())
     }
 }

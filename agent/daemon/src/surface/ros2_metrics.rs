@@ -463,7 +463,7 @@ pub(super) fn writers(
         sink.family(metric, |family| {
             rows.iter()
                 .filter(|_| settings.per_writer)
-                .try_for_each(|row| each_writer(family, row, value))
+                .try_for_each(|row| for_each_writer(family, row, value))
         })?;
     }
     Ok(())
@@ -548,7 +548,7 @@ fn join_values<'a>(values: impl Iterator<Item = &'a str>) -> String {
     text
 }
 
-fn each_writer(family: &mut Family<'_>, row: &TopicRow<'_>, value: Count) -> fmt::Result {
+fn for_each_writer(family: &mut Family<'_>, row: &TopicRow<'_>, value: Count) -> fmt::Result {
     let mut seen = BTreeSet::new();
     for writer in row.facts.iter().flat_map(|facts| &facts.publishers) {
         let Some(measured) = &writer.measurement else {

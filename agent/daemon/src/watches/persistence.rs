@@ -238,7 +238,8 @@ impl WatchWriter {
         !self.mailbox.pending().is_failing && self.mailbox.progress.stalled().is_none()
     }
 
-    /// Waits until the latest list is written, or its write has failed, for at most [`END_TIMEOUT`].
+    /// Waits until the latest list is written, or its write has failed, for at most
+    /// [`END_TIMEOUT`].
     pub(super) fn finish(&self) {
         self.mailbox.pending().is_closed = true;
         self.mailbox.changed.notify_one();

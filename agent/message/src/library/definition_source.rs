@@ -79,7 +79,10 @@ impl DefinitionSource {
                 (path, text)
             }
         };
-        let definition = if path.extension().is_some_and(|extension| extension == IDL_EXTENSION) {
+        let definition = if path
+            .extension()
+            .is_some_and(|extension| extension == IDL_EXTENSION)
+        {
             Definition::parse_idl(name.clone(), &text)
         } else {
             Definition::parse(name.clone(), &text)

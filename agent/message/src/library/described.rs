@@ -150,8 +150,8 @@ impl Described {
         }
     }
 
-    /// Returns the type with the announced hash, RIHS01 or that of XTypes. Returns the latest one if
-    /// no hash is announced.
+    /// Returns the type with the announced hash, RIHS01 or that of XTypes. Returns the latest one
+    /// if no hash is announced.
     pub(super) fn find(
         &self,
         name: &TypeName,
@@ -268,7 +268,8 @@ impl Types {
             let found = latest.map(|(_, entry)| Arc::clone(&entry.value));
             return found.ok_or(None);
         };
-        let is_same_kind = |hash: &str| hash.starts_with(HASH_PREFIX) == announced.starts_with(HASH_PREFIX);
+        let is_same_kind =
+            |hash: &str| hash.starts_with(HASH_PREFIX) == announced.starts_with(HASH_PREFIX);
         let other = of_name.find(|((_, hash), _)| is_same_kind(hash));
         let other = other.map(|((_, hash), _)| hash.clone());
         if let Some(entry) = self

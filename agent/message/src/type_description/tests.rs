@@ -288,7 +288,10 @@ fn a_lookup_finds_an_offered_type_only_by_its_hash() {
     assert_eq!(library.find(THING, None).unwrap().type_hash(), hash);
     let other = format!("RIHS01_{}", "0".repeat(64));
     let failure = library.find(THING, Some(&other)).unwrap_err();
-    assert!(matches!(failure, NotFound::OtherDefinition { .. }), "{failure}");
+    assert!(
+        matches!(failure, NotFound::OtherDefinition { .. }),
+        "{failure}"
+    );
     assert!(
         failure.to_string().contains("that a node described"),
         "{failure}"

@@ -126,7 +126,11 @@ impl<E: Export> Delivery<E> {
     }
 
     /// Delivers a batch until it is answered, until `newer`, or until the agent stops.
-    pub(super) async fn deliver(&mut self, batch: &E::Batch, newer: Option<Instant>) -> BatchResult {
+    pub(super) async fn deliver(
+        &mut self,
+        batch: &E::Batch,
+        newer: Option<Instant>,
+    ) -> BatchResult {
         let stop = self.stop.clone();
         let settled = {
             let offers = async {

@@ -196,12 +196,16 @@ fn gauge(meter: &Meter, metric: &'static Metric, observed: &Observed) {
     if whole {
         let gauge = meter.u64_observable_gauge(name.clone());
         let gauge = gauge.with_description(help).with_unit(unit);
-        gauge.with_callback(observed.clone().add_integers(metric)).build();
+        gauge
+            .with_callback(observed.clone().add_integers(metric))
+            .build();
     }
     if real {
         let gauge = meter.f64_observable_gauge(name);
         let gauge = gauge.with_description(help).with_unit(unit);
-        gauge.with_callback(observed.clone().add_floats(metric)).build();
+        gauge
+            .with_callback(observed.clone().add_floats(metric))
+            .build();
     }
 }
 

@@ -12,7 +12,7 @@ use opentelemetry_sdk::error::OTelSdkResult;
 use opentelemetry_sdk::metrics::exporter::PushMetricExporter as _;
 use tokio::time::{MissedTickBehavior, interval_at};
 
-use super::delivery::{Delivery, Export, BatchResult};
+use super::delivery::{BatchResult, Delivery, Export};
 use super::encoded::EncodedSender;
 use super::points::{Batch, Collection, Points};
 use crate::metric_sink::MetricSink;

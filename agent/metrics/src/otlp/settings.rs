@@ -407,7 +407,7 @@ mod tests {
     }
 
     #[test]
-    fn without_an_endpoint_nothing_is_exported() {
+    fn without_an_endpoint_the_exporter_is_disabled() {
         let unset = OtlpSettings::default();
         assert!(resolve(&unset, &[]).unwrap().is_none());
         let set = [("OTEL_EXPORTER_OTLP_ENDPOINT", "http://collector:4317")];
@@ -435,7 +435,7 @@ mod tests {
     }
 
     #[test]
-    fn standard_variables_are_honoured() {
+    fn standard_otel_variables_are_applied() {
         let settings = resolve(
             &OtlpSettings::default(),
             &[

@@ -91,7 +91,9 @@ impl SpanSink {
         let calls = late.calls.iter();
         let refused = calls.map(|(domain_id, example)| {
             let spans = LateSpan::of(*domain_id, example).into_iter();
-            self.queue.0.add_all_or_none(spans.map(QueuedSpan::LateCall))
+            self.queue
+                .0
+                .add_all_or_none(spans.map(QueuedSpan::LateCall))
         });
         late.lost + refused.sum::<u64>()
     }

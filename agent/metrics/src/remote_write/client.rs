@@ -53,8 +53,8 @@ pub(super) enum WriteResult {
     Refused(String, Option<u64>),
     /// The receiver does not know this version.
     UnknownVersion,
-    /// A success that does not state what was written: of a receiver that does not know version 2.0,
-    /// or of something between it and the robot.
+    /// A success that does not state what was written: of a receiver that does not know version
+    /// 2.0, or of something between it and the robot.
     Unconfirmed,
 }
 
@@ -268,7 +268,10 @@ mod tests {
         let two = |response: &_| answer(response, Version::Two);
         let again = |text: &str, pause| WriteResult::RetryLater(text.to_owned(), pause);
         assert_eq!(one(&reply(204, &[], "")), WriteResult::Accepted);
-        assert_eq!(two(&reply(204, &[(SAMPLES_WRITTEN_HEADER, "3")], "")), WriteResult::Accepted);
+        assert_eq!(
+            two(&reply(204, &[(SAMPLES_WRITTEN_HEADER, "3")], "")),
+            WriteResult::Accepted
+        );
         assert_eq!(two(&reply(204, &[], "")), WriteResult::Unconfirmed);
         for status in [400, 415] {
             assert_eq!(two(&reply(status, &[], "")), WriteResult::UnknownVersion);
@@ -276,7 +279,11 @@ mod tests {
         let old = one(&reply(400, &[], "out of order\n"));
         let reason = "400 Bad Request: out of order".to_owned();
         assert_eq!(old, WriteResult::Refused(reason.clone(), None));
-        let partly = two(&reply(400, &[(SAMPLES_WRITTEN_HEADER, "2")], "out of order"));
+        let partly = two(&reply(
+            400,
+            &[(SAMPLES_WRITTEN_HEADER, "2")],
+            "out of order",
+        ));
         assert_eq!(partly, WriteResult::Refused(reason, Some(2)));
         let pause = Some(Duration::from_secs(7));
         let busy = reply(429, &[("retry-after", "7")], "");

@@ -13,8 +13,8 @@ use tokio::time::{MissedTickBehavior, interval_at, sleep};
 use tokio_util::sync::CancellationToken;
 
 use super::backlog::Backlog;
-use super::client::{WriteResult, Client};
-use super::figures::{SampleFate, Figures, Request, now};
+use super::client::{Client, WriteResult};
+use super::figures::{Figures, Request, SampleFate, now};
 use super::request::{Version, body};
 use super::samples::{Samples, Scrape};
 use super::settings::{Settings, SettingsError};
@@ -269,7 +269,10 @@ impl Sender<'_> {
 
     /// Sends samples until the receiver writes or refuses them. An error has its reason, and the
     /// number of samples that the receiver wrote.
-    async fn send_until_settled(&mut self, part: &[Arc<Scrape>]) -> Result<(), (String, Option<u64>)> {
+    async fn send_until_settled(
+        &mut self,
+        part: &[Arc<Scrape>],
+    ) -> Result<(), (String, Option<u64>)> {
         let mut pause = FIRST_PAUSE;
         let mut body = self.body(part);
         loop {

@@ -55,8 +55,8 @@ impl Samples {
         self.add(1.0);
     }
 
-    /// Ends a collection. Returns its samples, with [`STALE_NAN`] for each series that ended, and the
-    /// number of samples that did not fit.
+    /// Ends a collection. Returns its samples, with [`STALE_NAN`] for each series that ended, and
+    /// the number of samples that did not fit.
     pub(super) fn end(&mut self, at: i64) -> (Scrape, u64) {
         let mut samples = std::mem::take(&mut self.collected);
         self.known.retain(|key, last| {
@@ -71,7 +71,11 @@ impl Samples {
 
     /// Returns the end of all series.
     pub(super) fn end_all(&mut self, at: i64) -> Scrape {
-        let samples = self.known.drain().map(|(key, _)| (key, STALE_NAN)).collect();
+        let samples = self
+            .known
+            .drain()
+            .map(|(key, _)| (key, STALE_NAN))
+            .collect();
         Scrape { at, samples }
     }
 
@@ -180,7 +184,8 @@ pub(super) fn parts(key: &[u8]) -> (u8, impl Iterator<Item = &str>) {
         .split_first()
         .map_or((0, key), |(kind, rest)| (*kind, rest));
     let texts = texts.split_inclusive(|byte| *byte == TEXT_END);
-    let texts = texts.map(|text| std::str::from_utf8(text.strip_suffix(&[TEXT_END]).unwrap_or(text)));
+    let texts =
+        texts.map(|text| std::str::from_utf8(text.strip_suffix(&[TEXT_END]).unwrap_or(text)));
     (kind, texts.map(Result::unwrap_or_default))
 }
 

@@ -1,12 +1,13 @@
 //! Offsets between the clocks of hosts, with bounds, from traffic alone.
 //!
-//! A message that a peer stamps at `s` arrives at `a`. The peer's clock was at least `s` then, so it
-//! is ahead of this host's clock by at least `s - a`. Most messages are late, so the greatest of
+//! A message that a peer stamps at `s` arrives at `a`. The peer's clock was at least `s` then, so
+//! it is ahead of this host's clock by at least `s - a`. Most messages are late, so the greatest of
 //! these values counts. The other bound needs a message of this host that reached the peer:
 //!
 //! - A reply follows its request. A request that left at `d` and a reply stamped `s` show that the
 //!   peer is ahead by at most `s - d`. This holds whatever the network does.
-//! - An ACKNACK has no stamp, but it follows the message that it acknowledges, and the HEARTBEAT that
+//! - An ACKNACK has no stamp, but it follows the message that it acknowledges, and the HEARTBEAT
+//! that
 //!   requested it. The time from the later one is a round trip. The peer is ahead by at most the
 //!   lower bound and the fastest round trip. This assumes that the fastest of many messages took no
 //!   longer than that.
@@ -363,7 +364,9 @@ impl Sent {
     }
 
     fn announce(&mut self, number: SequenceNumber, at: ModelTime) {
-        let before = self.announced.filter(|before| at - before.last < MAX_RESPONSE_DELAY);
+        let before = self
+            .announced
+            .filter(|before| at - before.last < MAX_RESPONSE_DELAY);
         self.announced = Some(Announced {
             first: before.map_or(at, |before| before.first),
             last: at,

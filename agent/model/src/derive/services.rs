@@ -36,7 +36,7 @@ use crate::facts::observation::{Head, Sample};
 use crate::facts::tables::{CallIdentities, OpenCalls, ServiceFigures, ServiceWriters};
 use crate::facts::topic_kind::TopicKind;
 use action::Action;
-use service::{CallId, Position, Service, Capture};
+use service::{CallId, Capture, Position, Service};
 
 /// Maximum bytes per second of one writer. A writer that exceeds it is not captured for a while.
 const MAX_BYTES_PER_SECOND: usize = 4 << 20;

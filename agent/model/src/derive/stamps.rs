@@ -214,8 +214,8 @@ impl StampWriter {
         }
         let steps = self.least.iter().zip(self.least.iter().skip(1));
         let steps: Vec<_> = steps.map(|(before, after)| after - before).collect();
-        let is_steady =
-            steps.iter().all(|step| *step >= MIN_DRIFT_NANOSECONDS) || steps.iter().all(|step| *step <= -MIN_DRIFT_NANOSECONDS);
+        let is_steady = steps.iter().all(|step| *step >= MIN_DRIFT_NANOSECONDS)
+            || steps.iter().all(|step| *step <= -MIN_DRIFT_NANOSECONDS);
         let sum: i64 = steps.iter().sum();
         is_steady.then_some((StampFault::Drifting, sum))
     }

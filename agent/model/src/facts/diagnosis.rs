@@ -289,8 +289,8 @@ pub enum Diagnosis {
         /// The offset was wrong by at most this number of nanoseconds.
         uncertainty: i64,
     },
-    /// A publisher and a subscription of one type have no counterpart. Their topics differ so little
-    /// that one of them is probably a mistake.
+    /// A publisher and a subscription of one type have no counterpart. Their topics differ so
+    /// little that one of them is probably a mistake.
     NearMiss {
         /// Topic of the publisher.
         topic: TopicKey,
@@ -299,8 +299,8 @@ pub enum Diagnosis {
         /// How the topics differ.
         difference: Difference,
     },
-    /// A managed node has not been active for at least 5 s, although the configuration expects it or
-    /// its last transition failed.
+    /// A managed node has not been active for at least 5 s, although the configuration expects it
+    /// or its last transition failed.
     NodeInactive {
         /// Domain.
         domain_id: DomainId,
@@ -779,7 +779,7 @@ mod tests {
     }
 
     #[test]
-    fn comparing_identities_gives_the_order_of_the_list() {
+    fn comparing_identities_yields_the_order_of_the_list() {
         let mut all = [
             unmatched("/b", 1, Unmatched::NoEndpoint),
             unmatched("/a", 2, Unmatched::Qos),

@@ -113,7 +113,7 @@ impl Journal {
 
     /// Adds a receiver's loss, extending one of the latest entries if the loss continues it.
     pub fn lose_delivery(&mut self, loss: DeliveryLoss) {
-        let whose = |loss: &DeliveryLoss| {
+        let key_of = |loss: &DeliveryLoss| {
             let DeliveryLoss {
                 writer,
                 participant,
@@ -126,7 +126,7 @@ impl Journal {
         };
         let mut recent = self.delivery_losses.iter_mut().rev().take(MAX_EXTENDED);
         let continued =
-            recent.find(|entry| whose(entry) == whose(&loss) && entry.last.precedes(loss.first));
+            recent.find(|entry| key_of(entry) == key_of(&loss) && entry.last.precedes(loss.first));
         if let Some(entry) = continued {
             (entry.last, entry.at) = (loss.last, loss.at);
             return;

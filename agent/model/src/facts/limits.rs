@@ -345,13 +345,13 @@ impl Limits {
     /// each), and responses that wait (2 MiB).
     pub const TYPE_BYTES: usize = 18 << 20;
 
-    /// Memory of what the robot itself says, in bytes. Logs take 6 MiB, parameters and their changes
-    /// 4 MiB, values of diagnostics and messages with fields 1 MiB each. The rest is for transforms,
-    /// frames, stamps and states of nodes.
+    /// Memory of what the robot itself says, in bytes. Logs take 6 MiB, parameters and their
+    /// changes 4 MiB, values of diagnostics and messages with fields 1 MiB each. The rest is for
+    /// transforms, frames, stamps and states of nodes.
     pub const ROBOT_BYTES: usize = 14 << 20;
 
-    /// Memory of the history on disk while a minute is written, in bytes: its rows and blocks (6 MiB,
-    /// ten minutes merged into steps included), and events (4 MiB).
+    /// Memory of the history on disk while a minute is written, in bytes: its rows and blocks (6
+    /// MiB, ten minutes merged into steps included), and events (4 MiB).
     pub const HISTORY_BYTES: usize = 10 << 20;
 
     /// Returns the memory in bytes that all limits together allow.

@@ -178,8 +178,8 @@ impl TopicLoss {
         }
     }
 
-    /// Records the last share of a writer that left, if it lost more than the others that left in this
-    /// second.
+    /// Records the last share of a writer that left, if it lost more than the others that left in
+    /// this second.
     pub(crate) const fn note_departed(&mut self, share: LossShare) {
         if share.lost > self.departed.lost {
             self.departed = share;

@@ -125,8 +125,8 @@ pub struct TransformFault {
     /// Edges with this fault and these names, of which the fault has the first one; or topics that
     /// name the frame.
     pub edges: usize,
-    /// Nodes that broadcast the edge, the roots of the trees, or topics that name the frame; at most
-    /// four.
+    /// Nodes that broadcast the edge, the roots of the trees, or topics that name the frame; at
+    /// most four.
     pub names: Vec<Arc<str>>,
 }
 

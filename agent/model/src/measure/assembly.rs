@@ -152,13 +152,17 @@ impl Assembly {
             while self.handed_out.len() >= MAX_SPARE_BUFFERS || self.handed_out_bytes() > others {
                 self.handed_out.pop_front();
             }
-            self.handed_out.push_back((part.last_changed, payload.clone()));
+            self.handed_out
+                .push_back((part.last_changed, payload.clone()));
         }
         Some(payload)
     }
 
     fn handed_out_bytes(&self) -> usize {
-        self.handed_out.iter().map(|(_, payload)| payload.len()).sum()
+        self.handed_out
+            .iter()
+            .map(|(_, payload)| payload.len())
+            .sum()
     }
 
     /// Returns an empty buffer. A large one may be that of an earlier payload that has no reader
@@ -168,7 +172,9 @@ impl Assembly {
             (size..=2 * size).contains(&payload.len()) && payload.is_unique()
         };
         let index = (size >= MIN_REUSED_BUFFER).then(|| self.handed_out.iter().position(is_free));
-        let free = index.flatten().and_then(|index| self.handed_out.remove(index));
+        let free = index
+            .flatten()
+            .and_then(|index| self.handed_out.remove(index));
         let mut buffer = free.map_or_else(Vec::new, |(_, payload)| Vec::from(payload));
         buffer.clear();
         buffer
@@ -187,7 +193,8 @@ impl Assembly {
     /// Drops samples that have received no fragment for a long time.
     pub fn expire(&mut self, now: ModelTime) {
         self.retain(|_, part| part.last_changed + FRAGMENT_TIMEOUT > now);
-        self.handed_out.retain(|(at, _)| *at + SPARE_BUFFER_LIFETIME > now);
+        self.handed_out
+            .retain(|(at, _)| *at + SPARE_BUFFER_LIFETIME > now);
     }
 
     fn retain(&mut self, mut keep: impl FnMut(&(Guid, SequenceNumber), &Part) -> bool) {

@@ -35,8 +35,8 @@ use crate::measure::writer::{BEST_EFFORT_WINDOW, settle_window};
 use accounting::Accounting;
 pub use accounting::Totals;
 
-/// Maximum number of samples, missed while there was no reader, that are excused one by one. If
-/// there are more, the delivery restarts.
+/// Maximum number of samples, missed while there was no reader, that are marked irrelevant one by
+/// one. If there are more, the delivery restarts.
 const MAX_IRRELEVANT_AT_START: u64 = 512;
 /// Samples that left this host less than this ago may still arrive.
 const MAX_TRANSIT_TIME: Duration = Duration::from_secs(1);
@@ -82,14 +82,14 @@ pub struct Delivery {
     first_seen: ModelTime,
     last_seen: ModelTime,
     /// Time at which a matching reader last appeared or capture missed bytes; earlier gaps are
-    /// excused.
+    /// irrelevant.
     opened: ModelTime,
     /// Time at which the oldest sample that has not arrived left this host for the receiver.
     waiting: Option<ModelTime>,
     /// Whether samples that left after `waiting` are already counted as lost.
     presumed_lost: bool,
-    /// Number of samples that left this host for the receiver at least [`MAX_TRANSIT_TIME`] ago and have
-    /// not arrived.
+    /// Number of samples that left this host for the receiver at least [`MAX_TRANSIT_TIME`] ago and
+    /// have not arrived.
     overdue: u64,
     /// Losses of the last seconds.
     recent: RecentLoss,
@@ -101,8 +101,8 @@ pub struct Delivery {
     withheld: Option<Bounded<WithheldLosses, VecDeque<DeliveryLoss>>>,
     /// The TCP connection of the newest sample, and the first number that only it carries.
     connection: Option<(Connection, SequenceNumber)>,
-    /// Number of samples that the writer's totals contain twice. Totals never decrease, so this many
-    /// further samples are not added to them.
+    /// Number of samples that the writer's totals contain twice. Totals never decrease, so this
+    /// many further samples are not added to them.
     counted_twice: u64,
 }
 
@@ -216,13 +216,13 @@ impl Delivery {
     }
 
     /// Records that a reader appeared, or that capture missed bytes. Gaps from before `at` are
-    /// excused.
+    /// irrelevant.
     pub fn open(&mut self, at: ModelTime) {
         self.opened = self.opened.max(at);
     }
 
     /// Records that bytes for the receiver were not captured: samples missing before `at` are
-    /// excused, also those of which some fragments arrived.
+    /// irrelevant, also those of which some fragments arrived.
     pub fn interrupt(&mut self, at: ModelTime) {
         self.open(at);
         self.reception.interrupt();
@@ -304,7 +304,9 @@ impl Delivery {
             return;
         }
         if self.loss_causes.resolve(number) {
-            self.split(context).2.explain(LossCause::Reassembly, number);
+            self.split(context)
+                .2
+                .set_cause(LossCause::Reassembly, number);
             return;
         }
         self.record_cause(number, LossCause::Reassembly, context);
@@ -534,8 +536,8 @@ impl Delivery {
         }
     }
 
-    /// Handles a sample that arrives after it was settled as lost. A whole sample whose loss cause is
-    /// still pending counts as recovered. Any other sample counts as a duplicate.
+    /// Handles a sample that arrives after it was settled as lost. A whole sample whose loss cause
+    /// is still pending counts as recovered. Any other sample counts as a duplicate.
     fn late(
         &mut self,
         sample: &Sample,

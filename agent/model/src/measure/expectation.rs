@@ -1,21 +1,22 @@
 //! Evaluates the expectations of watchlist entries on their topics.
 //!
 //! Evaluation takes place once per second of the source's clock. A topic becomes violated after
-//! `BAD` bad evaluations in a row and recovers after `EVALUATIONS_TO_RECOVER` good ones. Rates are evaluated over a
-//! window of at least three expected messages (1 to 10 s), or over the window of the entry. One
-//! message of tolerance at the window's edges keeps a healthy periodic topic stable. Silence has
-//! its own time and no hysteresis. A silence between two messages, which ended before it was
-//! evaluated, violates at once, and recovers as the others do. The end of a window counts for `min_rate_hz` only as far as its
-//! messages are known. The messages of a sampled topic are known once polling sees the next one.
+//! `BAD` bad evaluations in a row and recovers after `EVALUATIONS_TO_RECOVER` good ones. Rates are
+//! evaluated over a window of at least three expected messages (1 to 10 s), or over the window of
+//! the entry. One message of tolerance at the window's edges keeps a healthy periodic topic stable.
+//! Silence has its own time and no hysteresis. A silence between two messages, which ended before
+//! it was evaluated, violates at once, and recovers as the others do. The end of a window counts
+//! for `min_rate_hz` only as far as its messages are known. The messages of a sampled topic are
+//! known once polling sees the next one.
 //!
 //! Windows and silences begin at the earliest when the agent can see the messages. That is after
 //! its own start, the first publisher or subscriber, and a time in which the source saw nothing. A
 //! topic that was silent before such a time stays silent until its next message.
 //!
-//! The numbers of publishers and subscribers are evaluated once `STARTUP_GRACE_SECONDS` has passed since the first
-//! publisher appeared, because a robot needs time to start. A writer without a reader mostly sends
-//! nothing. A quiet topic without a subscriber therefore violates neither `min_rate_hz` nor
-//! `max_silence_s`, but it may violate `publishers` and `subscribers`.
+//! The numbers of publishers and subscribers are evaluated once `STARTUP_GRACE_SECONDS` has passed
+//! since the first publisher appeared, because a robot needs time to start. A writer without a
+//! reader mostly sends nothing. A quiet topic without a subscriber therefore violates neither
+//! `min_rate_hz` nor `max_silence_s`, but it may violate `publishers` and `subscribers`.
 
 use std::time::Duration;
 
@@ -149,8 +150,8 @@ impl TopicEvaluation {
             .collect()
     }
 
-    /// Evaluates the topic. Returns the previous state if the state changed; it is `None` at the first
-    /// evaluation, at which any state but `Ok` counts as a change.
+    /// Evaluates the topic. Returns the previous state if the state changed; it is `None` at the
+    /// first evaluation, at which any state but `Ok` counts as a change.
     pub fn judge(
         &mut self,
         expectations: &Expectations,
@@ -404,7 +405,7 @@ mod tests {
     }
 
     #[test]
-    fn an_interval_from_before_the_messages_were_expected_is_no_gap() {
+    fn an_interval_that_began_before_messages_were_expected_is_not_a_gap() {
         let mut bench = without_silence_above(0.2);
         assert_eq!(bench.second(gap(60.0)), WatchState::Ok);
         assert_eq!(bench.second(gap(0.1)), WatchState::Ok);
@@ -413,7 +414,7 @@ mod tests {
     }
 
     #[test]
-    fn the_end_of_a_silence_is_no_second_violation() {
+    fn the_end_of_a_silence_is_not_a_second_violation() {
         let mut bench = without_silence_above(1.5);
         for messages in [10, 10, 10, 0, 0] {
             bench.second(rate(messages));

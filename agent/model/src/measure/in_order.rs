@@ -5,8 +5,8 @@
 //! retransmission, a GAP or HEARTBEAT of the writer, ACKNACKs of the readers, or the decision about
 //! a loss closes it. The time of the sample is then the time at which the gap closed. The waiting
 //! samples are bounded in number, bytes and time. Beyond these bounds they are dispatched, and a
-//! late retransmission follows out of order. Otherwise samples wait only after a gap, for a reliable
-//! reader on this host: ACKNACKs of readers on other hosts are not seen.
+//! late retransmission follows out of order. Otherwise samples wait only after a gap, for a
+//! reliable reader on this host: ACKNACKs of readers on other hosts are not seen.
 //!
 //! Samples of every writer also wait while uprobes take over from polling: the last message that
 //! both views may have seen can arrive after later ones. The readers do not wait for it, so these
@@ -117,8 +117,8 @@ impl InOrder {
         self.earlier.contains(&number)
     }
 
-    /// Begins a new incarnation after all samples of the previous one are dispatched. Returns whether
-    /// there was a previous one.
+    /// Begins a new incarnation after all samples of the previous one are dispatched. Returns
+    /// whether there was a previous one.
     pub fn begin(
         &mut self,
         incarnation: u32,
@@ -208,7 +208,12 @@ impl InOrder {
         }
     }
 
-    fn dispatch(&mut self, queued: QueuedSample, now: ModelTime, give: &mut impl FnMut(QueuedSample)) {
+    fn dispatch(
+        &mut self,
+        queued: QueuedSample,
+        now: ModelTime,
+        give: &mut impl FnMut(QueuedSample),
+    ) {
         self.bytes -= queued.cost();
         let came = queued.sample.time;
         // The reader may have received the lower number through unobserved shared memory. This

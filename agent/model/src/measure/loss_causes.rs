@@ -50,7 +50,7 @@ impl LossCauses {
         self.known.insert(number, KnownLoss { cause, at }).is_some()
     }
 
-    /// Removes and returns the known loss of a sample that arrived after all or was excused.
+    /// Removes and returns the known loss of a sample that arrived after all or became irrelevant.
     pub fn forget(&mut self, number: SequenceNumber) -> Option<KnownLoss> {
         if self.known.is_empty() {
             return None;
@@ -58,8 +58,8 @@ impl LossCauses {
         self.known.remove(&number)
     }
 
-    /// Removes the known causes of `first..=last`. Visits each number with a known cause alone, and the
-    /// others as runs without a cause.
+    /// Removes the known causes of `first..=last`. Visits each number with a known cause alone, and
+    /// the others as runs without a cause.
     pub fn explain(
         &mut self,
         first: SequenceNumber,

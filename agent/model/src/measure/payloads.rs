@@ -261,15 +261,11 @@ impl Payloads {
         if counted.unconfirmed || is_complete {
             let queued = order.pass(queued, counted.at);
             before.push(queued);
-            before
-                .into_iter()
-                .for_each(|queued| self.enqueue(queued));
+            before.into_iter().for_each(|queued| self.enqueue(queued));
             return None;
         }
         order.put(queued);
-        before
-            .into_iter()
-            .for_each(|queued| self.enqueue(queued));
+        before.into_iter().for_each(|queued| self.enqueue(queued));
         self.dispatch_ready(writer, progress, counted.at)
     }
 
@@ -392,9 +388,7 @@ impl Payloads {
         let mut queued = Vec::new();
         let skip = order.turn(progress, now, room, &mut |each| queued.push(each));
         self.unannounced(writer, &forgone, now);
-        queued
-            .into_iter()
-            .for_each(|queued| self.enqueue(queued));
+        queued.into_iter().for_each(|queued| self.enqueue(queued));
         skip
     }
 
@@ -411,9 +405,7 @@ impl Payloads {
             .order
             .dispatch_all(now, &mut |each| queued.push(each));
         self.unannounced(writer, &forgone, now);
-        queued
-            .into_iter()
-            .for_each(|queued| self.enqueue(queued));
+        queued.into_iter().for_each(|queued| self.enqueue(queued));
     }
 
     /// Reports samples that will not arrive, at `now`.
@@ -471,7 +463,9 @@ impl Payloads {
                     missed.samples = missed.samples.min(samples);
                 }
             }
-            missed.into_iter().for_each(|missed| self.push_dispatch(missed, 0));
+            missed
+                .into_iter()
+                .for_each(|missed| self.push_dispatch(missed, 0));
         }
     }
 
@@ -486,7 +480,9 @@ impl Payloads {
             .filter_map(|run| Some((*run.first()?, *run.last()?)))
             .flat_map(|run| interested.missed(writer, run, reason, delay))
             .collect();
-        missed.into_iter().for_each(|missed| self.push_dispatch(missed, 0));
+        missed
+            .into_iter()
+            .for_each(|missed| self.push_dispatch(missed, 0));
     }
 
     fn enqueue(&mut self, queued: QueuedSample) {

@@ -42,7 +42,8 @@ pub struct Receivers {
     sockets: Sockets,
     socket_users: Bounded<Counted<UsedSockets>, HashMap<u64, SocketUsers>>,
     processes: Bounded<Counted<SocketProcesses>, HashMap<u32, Candidates>>,
-    /// Participants that send through a socket of this host. [`Self::remove_unknown`] rebuilds the set.
+    /// Participants that send through a socket of this host. [`Self::remove_unknown`] rebuilds the
+    /// set.
     local: Bounded<Counted<LocalParticipants>, HashSet<GuidPrefix>>,
     /// Participants whose messages left this host through an unobserved socket or shared memory.
     local_by_departure: Bounded<Counted<ParticipantsHere>, HashSet<GuidPrefix>>,
@@ -258,7 +259,10 @@ impl Receivers {
         if list.is_some_and(|list| list.0.contains(&owner)) {
             return is_sent && known.is_some_and(|known| !known.is_crowded);
         }
-        let Some(known) = self.socket_users.get_or_insert_with(socket, SocketUsers::default) else {
+        let Some(known) = self
+            .socket_users
+            .get_or_insert_with(socket, SocketUsers::default)
+        else {
             return false;
         };
         let mut is_local = false;
@@ -286,7 +290,10 @@ impl Receivers {
 
     /// Records that this participant owns a socket of this host.
     pub fn add_owner(&mut self, socket: u64, owner: GuidPrefix) {
-        let Some(known) = self.socket_users.get_or_insert_with(socket, SocketUsers::default) else {
+        let Some(known) = self
+            .socket_users
+            .get_or_insert_with(socket, SocketUsers::default)
+        else {
             return;
         };
         known.senders = Candidates::default();
@@ -305,7 +312,10 @@ impl Receivers {
 
     /// Withdraws a claim of [`Self::add_owner`]: the participant may not own the socket.
     pub fn remove_owner(&mut self, socket: u64, owner: GuidPrefix) {
-        let users = self.socket_users.get_mut(&socket).map(|users| &mut users.senders);
+        let users = self
+            .socket_users
+            .get_mut(&socket)
+            .map(|users| &mut users.senders);
         let process = self.sockets.get(socket).and_then(|facts| facts.process_id);
         let process = process.and_then(|process| self.processes.get_mut(&process));
         for candidates in users.into_iter().chain(process) {
@@ -403,7 +413,9 @@ impl Receivers {
                 return open;
             }
             let announced = facts.and_then(|facts| facts.own_process_id);
-            if let Some(owner) = announced.and_then(|process| participant_of_process(process, discovery)) {
+            if let Some(owner) =
+                announced.and_then(|process| participant_of_process(process, discovery))
+            {
                 return vec![owner];
             }
         }

@@ -11,7 +11,9 @@ use ros2probe_wire::{RtpsTime, SequenceNumber};
 use crate::facts::model_time::ModelTime;
 use crate::facts::observation::{Content, DataFrag, Gap, Heartbeat, Sample};
 use crate::measure::samples::{Budget, Facts, Progress, Samples};
-use crate::measure::sequence::{Arrival, MAX_TRUSTED_JUMP, RepairMode, RunMembership, Sequence, Settled};
+use crate::measure::sequence::{
+    Arrival, MAX_TRUSTED_JUMP, RepairMode, RunMembership, Sequence, Settled,
+};
 
 /// Minimum nanoseconds from the last fragment number to the completing fragment that indicate a
 /// retransmission.
@@ -241,7 +243,7 @@ impl Reception {
         self.samples.clear(budget);
     }
 
-    /// Excuses all samples after the last one that arrived, because the receiver is gone.
+    /// Marks all samples after the last one that arrived irrelevant, because the receiver is gone.
     pub fn close(&mut self, budget: &mut Budget) {
         let sequence = &mut self.sequence;
         for number in sequence.settled().until(sequence.next()).rev() {
@@ -416,7 +418,7 @@ fn decision(settled: Settled, samples: &mut Samples, budget: &mut Budget) -> Dec
         }
         Settled::Lost(number) => (number, number),
         Settled::LostRun(start, end) => (start, end.previous()),
-        // A sample with fragments was sent, so no excuse applies.
+        // A sample with fragments was sent, so it is not irrelevant.
         Settled::Irrelevant(number) if samples.is_partial(number) => (number, number),
         Settled::Irrelevant(number) => return Decision::Irrelevant(number),
     };

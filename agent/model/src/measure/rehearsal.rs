@@ -1,5 +1,5 @@
-//! Evaluates expectations on seconds that were counted earlier, as [`TopicEvaluation`] evaluates them
-//! live. Thresholds that were learnt from a robot are checked on the counts of the same robot.
+//! Evaluates expectations on seconds that were counted earlier, as [`TopicEvaluation`] evaluates
+//! them live. Thresholds that were learnt from a robot are checked on the counts of the same robot.
 
 use std::time::Duration;
 
@@ -152,7 +152,7 @@ mod tests {
     }
 
     #[test]
-    fn one_slow_second_violates_nothing_and_two_in_a_row_violate_the_rate() {
+    fn two_consecutive_slow_seconds_violate_the_rate_and_one_does_not() {
         let mut seconds = vec![steady_seconds(10); 60];
         seconds[0].messages = 1;
         seconds[30].messages = 3;
@@ -166,7 +166,10 @@ mod tests {
         // 40 Hz on a busy robot, in pairs of slow seconds.
         let busy = |part: u32| -> Vec<Second> {
             let counts = [24, 26, 46, 44, 46, 46, 40, 48].into_iter().cycle();
-            counts.take(80).map(|count| steady_seconds(count / part)).collect()
+            counts
+                .take(80)
+                .map(|count| steady_seconds(count / part))
+                .collect()
         };
         let expecting = |window_s| Expectations {
             min_rate_hz: Some(30.0),

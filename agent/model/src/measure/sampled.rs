@@ -168,7 +168,12 @@ impl Sampled {
 
     /// Takes over counted samples that another view saw in part. `next` is the number after the
     /// newest.
-    pub fn add_partial(&mut self, partial: &[SequenceNumber], next: SequenceNumber, now: ModelTime) {
+    pub fn add_partial(
+        &mut self,
+        partial: &[SequenceNumber],
+        next: SequenceNumber,
+        now: ModelTime,
+    ) {
         self.follow(next, now);
         for &number in partial {
             match self.bit(number, next) {
@@ -250,7 +255,8 @@ impl Sampled {
         let interval = self.interval.unwrap_or(slowest.as_secs_f64());
         let unseen = self.span.saturating_sub(self.seen);
         let share = |missed: u64, of: u64| {
-            (missed as f64 + PRESUMED_MESSAGES * PRESUMED_MISSED_SHARE) / (of as f64 + PRESUMED_MESSAGES)
+            (missed as f64 + PRESUMED_MESSAGES * PRESUMED_MISSED_SHARE)
+                / (of as f64 + PRESUMED_MESSAGES)
         };
         let missed = share(unseen, self.span);
         let missed_again = share(unseen.saturating_sub(self.unseen_runs), unseen);
@@ -300,12 +306,12 @@ impl Sampled {
         }
         let before = sequence.next();
         self.follow(before, now);
-        let is_told_only = self
+        let is_unseen = self
             .bit(number, before)
             .is_some_and(|bit| self.seen_bits & bit == 0);
         let belief = match source {
             // The sample is late, and its writer has not restarted.
-            Some(source) if is_told_only => {
+            Some(source) if is_unseen => {
                 sequence.sourced(number, source);
                 RunMembership::Live
             }

@@ -52,7 +52,8 @@ pub struct Samples {
     partial: Bounded<PartialSamples, Vec<Partial>>,
     /// Samples that began before this time may lack fragments that were not captured.
     complete_from: ModelTime,
-    /// Whether bytes were missed since the last sample began, perhaps its next one's first fragments.
+    /// Whether bytes were missed since the last sample began, perhaps its next one's first
+    /// fragments.
     interrupted: bool,
 }
 

@@ -1,11 +1,11 @@
 //! Sequence numbers of one writer: which samples arrived, and which never will.
 //!
 //! A gap does not count as a loss immediately: it stays open for the settle window, so that
-//! reordered or retransmitted samples can fill it. Numbers excused by a GAP, an ACKNACK or the
-//! start of observation are never lost. The firstSN of a HEARTBEAT excuses nothing: a missing
-//! sample that the writer no longer has is lost (RTPS 2.5, 8.4.10.4, `lost_changes_update`). Memory
-//! is two or three bitmaps that grow with the undecided numbers, up to [`MAX_WINDOW`]. The module
-//! reads neither payloads nor a clock; callers pass the times in.
+//! reordered or retransmitted samples can fill it. Numbers made irrelevant by a GAP, an ACKNACK or
+//! the start of observation are never lost. The firstSN of a HEARTBEAT makes no number irrelevant:
+//! a missing sample that the writer no longer has is lost (RTPS 2.5, 8.4.10.4,
+//! `lost_changes_update`). Memory is two or three bitmaps that grow with the undecided numbers, up
+//! to [`MAX_WINDOW`]. The module reads neither payloads nor a clock; callers pass the times in.
 
 mod bitmap;
 mod runs;
@@ -143,7 +143,7 @@ pub enum RepairMode {
 pub enum Settled {
     /// The number never arrived.
     Lost(SequenceNumber),
-    /// The writer excused the number.
+    /// The number is irrelevant.
     Irrelevant(SequenceNumber),
     /// Lost numbers from the first up to, but not including, the second: the window is too small
     /// for them.
@@ -514,8 +514,8 @@ impl Sequence {
     fn settle(&mut self, limit: SequenceNumber, settled: &mut impl FnMut(Settled)) {
         for number in self.settled.until(limit.min(self.next)) {
             if !self.received.get(number) {
-                let excused = self.irrelevant.get(number);
-                settled(if excused {
+                let is_irrelevant = self.irrelevant.get(number);
+                settled(if is_irrelevant {
                     Settled::Irrelevant(number)
                 } else {
                     Settled::Lost(number)

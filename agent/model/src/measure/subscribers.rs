@@ -480,11 +480,15 @@ impl Subscribers {
             }
             return;
         }
-        let end = delivery.next().min(next.saturating_add(MAX_COMPARED_SAMPLES));
+        let end = delivery
+            .next()
+            .min(next.saturating_add(MAX_COMPARED_SAMPLES));
         if next == SequenceNumber::ZERO || end <= next + 1 {
             return;
         }
-        let missing = next.until(end).filter(|number| delivery.is_missing(*number));
+        let missing = next
+            .until(end)
+            .filter(|number| delivery.is_missing(*number));
         let has = |number: &SequenceNumber| {
             let mut others = self.deliveries.iter().filter(|each| is_open(each));
             others.any(|other| other.is_missing(*number) || other.has(*number))

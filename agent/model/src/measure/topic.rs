@@ -408,7 +408,9 @@ impl Topics {
                 let before = std::mem::take(&mut topic.judgements);
                 let judged = |watch| {
                     let known = before.iter().find(|(other, _)| *other == watch);
-                    known.copied().unwrap_or((watch, TopicEvaluation::default()))
+                    known
+                        .copied()
+                        .unwrap_or((watch, TopicEvaluation::default()))
                 };
                 covering.into_iter().map(judged).collect()
             }

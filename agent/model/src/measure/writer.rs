@@ -281,7 +281,7 @@ impl Writer {
 
     /// Processes an observation of this writer and returns the message that it completed. `opened`
     /// is the time at which this host last began to see its samples; samples missing before that
-    /// are excused.
+    /// are irrelevant.
     pub fn observe(
         &mut self,
         observation: &Observation,
@@ -349,7 +349,7 @@ impl Writer {
         let (next, advanced) = before;
         let sequence = self.reception.sequence_mut();
         if next > SequenceNumber::ZERO && advanced < opened && sequence.next() > next {
-            // The newest sample is excused too, which has no effect once it is received.
+            // The newest sample is marked irrelevant too, which has no effect once it is received.
             sequence.mark_irrelevant(next, sequence.next());
         }
         counted
@@ -610,7 +610,11 @@ impl Settling<'_> {
 /// Returns how far ahead the numbers of an observation may be. Polling shared memory misses more
 /// numbers.
 fn reach(head: &Head) -> u64 {
-    if head.is_polled() { MAX_ANNOUNCED_JUMP } else { MAX_TRUSTED_JUMP }
+    if head.is_polled() {
+        MAX_ANNOUNCED_JUMP
+    } else {
+        MAX_TRUSTED_JUMP
+    }
 }
 
 #[expect(

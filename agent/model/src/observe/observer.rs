@@ -363,8 +363,9 @@ impl Observer {
     /// message of such a writer must not be missed.
     fn awaits_writers(&self) -> bool {
         let mut requests = self.requested.sample_requests.iter();
-        requests
-            .any(|request| request.selection.is_open() || !self.measure.payloads.has_request(request.id))
+        requests.any(|request| {
+            request.selection.is_open() || !self.measure.payloads.has_request(request.id)
+        })
     }
 
     /// Processes a truncated datagram of a capture file: submessage headers count, payloads are not
@@ -648,7 +649,7 @@ impl Observer {
             }
         };
         match captured.is_polled {
-            true => Observation::each_polled(&found.record, clock, observe),
+            true => Observation::for_each_polled(&found.record, clock, observe),
             false => Observation::each(&found.record, clock, observe),
         }
     }

@@ -161,7 +161,7 @@ fn each_of_two_publishers_in_a_process_has_its_own_cpu_topic() {
 }
 
 #[test]
-fn a_change_from_the_cpu_topic_to_the_topic_itself_loses_nothing() {
+fn a_change_from_the_cpu_topic_to_the_base_topic_loses_no_message() {
     let (mut host, bob) = robot(CPU);
     publish(&mut host, bob, writer(0x22), 1..=10);
     publish(&mut host, bob, writer(0x21), 1..=5);
@@ -214,8 +214,8 @@ fn participants_with_one_machine_id_are_on_one_host_despite_different_guids() {
     }
 }
 
-/// A subscription in the publisher's process gets its references there, so that only those to another
-/// one are visible.
+/// A subscription in the publisher's process gets its references there, so that only those to
+/// another one are visible.
 #[test]
 fn references_count_whichever_subscription_gets_them_and_once() {
     let (mut host, bob) = robot(CUDA);

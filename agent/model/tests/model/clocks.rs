@@ -245,7 +245,7 @@ fn one_direction_yields_one_bound_and_no_offset() {
 }
 
 #[test]
-fn few_messages_and_repetitions_are_no_evidence_for_a_round_trip() {
+fn few_or_repeated_messages_are_not_evidence_of_a_round_trip() {
     let mut pair = Pair::new();
     pair.send_from_bob();
     for _ in 0..10 {
@@ -460,7 +460,7 @@ fn pairs_of_peers_follow_from_differences() {
 
 /// Alice's server replies to requests of Bob's client. The reply is stamped when it is written.
 #[test]
-fn replies_bound_the_offset_whatever_the_network_does() {
+fn replies_bound_the_offset_at_any_network_delay() {
     const REQUESTS: EntityId = EntityId([0, 0, 0x21, 0x03]);
     const REPLIES: EntityId = EntityId([0, 0, 0x22, 0x03]);
     const TYPE: &str = "example_interfaces::srv::dds_::AddTwoInts_Request_";

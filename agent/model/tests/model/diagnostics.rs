@@ -151,7 +151,7 @@ fn an_error_of_five_seconds_is_a_finding_until_it_ends() {
 }
 
 #[test]
-fn a_start_up_in_error_and_a_warning_are_no_findings() {
+fn errors_during_start_up_and_warnings_are_not_findings() {
     let mut robot = Robot::new();
     robot.publish_for(2, 4);
     robot.publish_for(1, 60);
@@ -202,7 +202,7 @@ fn the_diagnostics_of_a_removed_node_are_removed() {
 }
 
 #[test]
-fn what_an_aggregator_repeats_is_kept_and_is_no_finding_of_its_own() {
+fn repeated_statuses_of_an_aggregator_are_kept_without_a_finding() {
     let mut robot = Robot::with(Settings::default(), "rt/diagnostics_agg");
     robot.publish_for(2, 20);
     assert_eq!(robot.only().level, Error);

@@ -193,7 +193,7 @@ fn one_heartbeat_far_ahead_causes_no_loss() {
 }
 
 #[test]
-fn one_gap_far_ahead_excuses_no_sample() {
+fn one_gap_far_ahead_marks_no_sample_irrelevant() {
     for period in [10, 1000] {
         for number in [600, 4000, 1 << 20, 1 << 31] {
             let run = Run::new(true, period);

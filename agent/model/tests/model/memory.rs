@@ -273,7 +273,14 @@ fn all_limits_together_are_below_the_memory_limit_of_the_unit() {
         .find_map(|line| line.strip_prefix("MemoryMax="));
     let allowed = megabytes.unwrap().strip_suffix('M').unwrap();
     let allowed = allowed.parse::<usize>().unwrap() << 20;
-    let all = Limits::default().bytes() + Limits::CONSTANT_BYTES + Limits::ZENOH_BYTES + Limits::LATCHED_BYTES;
-    let all = all + Limits::INSIDE_BYTES + Limits::TYPE_BYTES + Limits::ROBOT_BYTES + Limits::HISTORY_BYTES;
+    let all = Limits::default().bytes()
+        + Limits::CONSTANT_BYTES
+        + Limits::ZENOH_BYTES
+        + Limits::LATCHED_BYTES;
+    let all = all
+        + Limits::INSIDE_BYTES
+        + Limits::TYPE_BYTES
+        + Limits::ROBOT_BYTES
+        + Limits::HISTORY_BYTES;
     assert!(all <= allowed, "{} of {} KiB", all >> 10, allowed >> 10);
 }

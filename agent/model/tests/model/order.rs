@@ -55,7 +55,10 @@ fn dispatched(host: &mut Host) -> Vec<(u64, u64)> {
 }
 
 fn numbers(host: &mut Host) -> Vec<u64> {
-    dispatched(host).into_iter().map(|(number, _)| number).collect()
+    dispatched(host)
+        .into_iter()
+        .map(|(number, _)| number)
+        .collect()
 }
 
 /// Returns reason, first and last number of missing samples.

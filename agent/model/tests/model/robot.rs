@@ -113,7 +113,7 @@ fn a_logger_names_the_node_that_is_not_announced() {
 }
 
 #[test]
-fn malformed_messages_and_text_of_other_encodings_cause_no_harm() {
+fn malformed_messages_and_text_of_other_encodings_are_counted_or_replaced() {
     let mut node = Node::new();
     node.send(&log(20, "robot1.lidar", b"a\xe9b \x1b[31m"));
     assert_eq!(&*node.facts().latest[0].text, "a\u{fffd}b \x1b[31m");

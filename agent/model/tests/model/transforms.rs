@@ -287,7 +287,7 @@ fn three_jumps_within_a_minute_are_a_fault_until_a_minute_after_the_first_one() 
 }
 
 #[test]
-fn a_stamp_that_goes_back_is_an_event_and_a_fault_for_a_minute() {
+fn a_backward_stamp_is_an_event_and_a_fault_for_a_minute() {
     let mut robot = Robot::new();
     robot.now = 100_000;
     robot.broadcast_for(FIRST, 3);

@@ -76,7 +76,7 @@ pub struct Crowd<C> {
     participants_created: u32,
     due: Instant,
     ticked: Instant,
-    owed: [f64; 3],
+    pending_messages: [f64; 3],
     next_topic: usize,
 }
 
@@ -96,7 +96,7 @@ impl<C: Carrier> Crowd<C> {
             participants_created: 0,
             due: now,
             ticked: now,
-            owed: [0.0; 3],
+            pending_messages: [0.0; 3],
             next_topic: 0,
         }
     }
@@ -192,7 +192,7 @@ impl<C: Carrier> Crowd<C> {
         let now = Instant::now();
         let passed = now.duration_since(self.ticked).as_secs_f64().min(0.1);
         self.ticked = now;
-        self.bury();
+        self.drop_expired();
         self.renew()?;
         if changes {
             let deaths = self.members.len().saturating_sub(STAYING) as f64;
@@ -201,16 +201,16 @@ impl<C: Carrier> Crowd<C> {
                 self.scale.endpoint_changes,
                 self.scale.messages,
             ];
-            for (owed, rate) in self.owed.iter_mut().zip(rates) {
+            for (owed, rate) in self.pending_messages.iter_mut().zip(rates) {
                 *owed += rate * passed;
             }
-            for _ in 0..self.owe(0) {
+            for _ in 0..self.schedule_messages(0) {
                 self.death()?;
             }
-            for _ in 0..self.owe(1) {
+            for _ in 0..self.schedule_messages(1) {
                 self.endpoint_change()?;
             }
-            for _ in 0..self.owe(2) {
+            for _ in 0..self.schedule_messages(2) {
                 self.message()?;
             }
             let surplus = self.members.len().saturating_sub(self.target);
@@ -226,14 +226,14 @@ impl<C: Carrier> Crowd<C> {
         Ok(())
     }
 
-    fn owe(&mut self, kind: usize) -> u64 {
-        let whole = self.owed[kind].floor();
-        self.owed[kind] -= whole;
+    fn schedule_messages(&mut self, kind: usize) -> u64 {
+        let whole = self.pending_messages[kind].floor();
+        self.pending_messages[kind] -= whole;
         whole as u64
     }
 
     /// Removes participants whose leases have ended.
-    fn bury(&mut self) {
+    fn drop_expired(&mut self) {
         let now = Instant::now();
         let (silenced, members) = std::mem::take(&mut self.members)
             .into_iter()

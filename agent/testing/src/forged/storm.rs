@@ -23,7 +23,9 @@ impl Storm {
     /// Sends datagrams made by `forge`, each time with a new GUID prefix.
     pub fn start(carrier: impl Carrier + Send + 'static, forge: fn(&mut Dice) -> Vec<u8>) -> Storm {
         let mut dice = Dice(0x9e37_79b9_7f4a_7c15);
-        let moulds: Vec<PacketTemplate> = (0..TEMPLATES).map(|_| PacketTemplate::new(forge(&mut dice))).collect();
+        let moulds: Vec<PacketTemplate> = (0..TEMPLATES)
+            .map(|_| PacketTemplate::new(forge(&mut dice)))
+            .collect();
         let mut next = (0..moulds.len()).cycle();
         Storm::run(carrier, move |bytes| {
             let mould = next.next().unwrap_or(0);

@@ -46,7 +46,11 @@ pub enum AttachMode {
 
 /// Attaches to a cgroup a foreign program that accepts all packets. It stays attached until the
 /// cgroup is removed.
-pub fn attach_foreign_program(cgroup: &Path, direction: Direction, manners: AttachMode) -> Result<()> {
+pub fn attach_foreign_program(
+    cgroup: &Path,
+    direction: Direction,
+    manners: AttachMode,
+) -> Result<()> {
     // r0 = 1; exit
     let instructions: [u64; 2] = [0x0000_0001_0000_00b7, 0x95];
     let license = c"GPL";

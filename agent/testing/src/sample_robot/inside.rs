@@ -10,7 +10,7 @@ use ros2probe_model::facts::calls::facts::{
     TopicInside,
 };
 use ros2probe_model::facts::calls::late::{Activity, Cause, LateBound, LateCall, Stage};
-use ros2probe_model::facts::calls::other_thread::{ThreadLabel, OtherThread, Priority};
+use ros2probe_model::facts::calls::other_thread::{OtherThread, Priority, ThreadLabel};
 use ros2probe_model::facts::calls::report::{Durations, ThreadStates, Trigger};
 use ros2probe_model::facts::diagnosis::{Diagnosis, TopicKey};
 use ros2probe_model::facts::model_time::ModelTime;

@@ -224,7 +224,7 @@ fn a_frame_longer_than_the_limit_is_passed_with_its_first_bytes() {
 }
 
 #[test]
-fn a_header_in_a_payload_begins_no_frame_of_a_known_direction() {
+fn a_header_within_a_payload_of_a_known_direction_is_ignored() {
     let mut connection = Connection::default();
     let inner = frame(&message(OTHER, b"inner"), PORT);
     let outer = message(ONE, &inner);

@@ -84,7 +84,7 @@ fn a_datagram_without_its_first_fragment_is_counted_but_not_identified() {
 
 #[test]
 fn a_datagram_with_fragments_too_far_apart_is_reported_when_given_up() {
-    static HELD: Mutex<Vec<Vec<u8>>> = Mutex::new(Vec::new());
+    static HELD_DATAGRAMS: Mutex<Vec<Vec<u8>>> = Mutex::new(Vec::new());
     let mut observed = Observed::new();
     let link = Link::new().unwrap();
     shorten_reassembly_timeout(&link.monitor);
@@ -96,13 +96,13 @@ fn a_datagram_with_fragments_too_far_apart_is_reported_when_given_up() {
         .set_interest(writer, Some(Verdict::Meter))
         .unwrap();
     let mut wire = Wire::new(&link.robot, &link.monitor, INTERFACE).unwrap();
-    wire.shuffle = |packets| *HELD.lock().unwrap() = packets.split_off(2);
+    wire.shuffle = |packets| *HELD_DATAGRAMS.lock().unwrap() = packets.split_off(2);
     wire.send(&talker.sample(20_000)).unwrap();
     wire.shuffle = |packets| packets.truncate(1);
     for _ in 2..=6 {
         wire.send(&talker.sample(20_000)).unwrap();
     }
-    wire.shuffle = |packets| *packets = HELD.lock().unwrap().drain(..).collect();
+    wire.shuffle = |packets| *packets = HELD_DATAGRAMS.lock().unwrap().drain(..).collect();
     wire.send(&talker.sample(20_000)).unwrap();
     let at_once = observed.records(writer, SETTLED);
     assert_eq!(fragment_numbers(&at_once), FragmentNumbers::from([(1, 0)]));

@@ -312,7 +312,7 @@ fn a_socket_keeps_its_numbers_while_more_sockets_than_the_cap_receive() -> Resul
 }
 
 #[test]
-fn a_filled_buffer_before_the_first_question_is_no_wait() -> Result<()> {
+fn a_buffer_filled_before_the_first_request_is_not_a_wait() -> Result<()> {
     let mut way = DeliveryBench::new()?;
     let mut deliveries = way.robot.deliveries.take().unwrap();
     deliveries.leave();

@@ -58,8 +58,8 @@ pub(super) fn late(robot: &mut Robot, process: &mut Process, command: &str) -> V
     robot.round().report.late
 }
 
-/// Asserts that each call is late for this cause, which took this share of its time or more. On a busy
-/// machine, a call may also wait for a CPU, even for longer. That time is left out.
+/// Asserts that each call is late for this cause, which took this share of its time or more. On a
+/// busy machine, a call may also wait for a CPU, even for longer. That time is left out.
 fn assert_cause(calls: &[LateCall], number: usize, cause: Cause, share: f64) {
     assert_eq!(calls.len(), number, "{calls:#?}");
     for call in calls {
@@ -170,9 +170,10 @@ fn a_call_beside_a_real_time_thread_names_that_thread() {
     let _hog = Hog::real_time("0");
     let calls = late(&mut robot, &mut process, "compute 10 60000");
     let is_named = |call: &LateCall| {
-        let culprit = call.longest_other_thread(Stage::Callback);
-        culprit.is_some_and(|culprit| {
-            &*culprit.name == "sh" && culprit.priority == Some(Priority::RealTime(50))
+        let delaying_thread = call.longest_other_thread(Stage::Callback);
+        delaying_thread.is_some_and(|delaying_thread| {
+            &*delaying_thread.name == "sh"
+                && delaying_thread.priority == Some(Priority::RealTime(50))
         })
     };
     let named = calls.iter().filter(|call| is_named(call)).count();

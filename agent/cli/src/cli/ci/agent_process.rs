@@ -167,7 +167,10 @@ impl AgentProcess {
 
     /// Returns the directory of the bag, which exists after [`Self::end`] if there is one.
     pub(super) fn recording(&self) -> PathBuf {
-        self.directory.path().join(RECORDINGS_DIRECTORY).join(BAG_NAME)
+        self.directory
+            .path()
+            .join(RECORDINGS_DIRECTORY)
+            .join(BAG_NAME)
     }
 
     pub(super) fn has_ended(&mut self) -> bool {

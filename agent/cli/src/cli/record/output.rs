@@ -265,7 +265,8 @@ impl<'a> RecordingOutput<'a> {
 }
 
 /// Reports the messages in the bag and the missing ones. Returns exit code 1 if the storage failed
-/// or nothing of a capture was readable, and [`EXIT_INCOMPLETE`] if messages of a capture are missing.
+/// or nothing of a capture was readable, and [`EXIT_INCOMPLETE`] if messages of a capture are
+/// missing.
 pub(super) fn report(ended: &Finished, outcome: &Outcome, is_replay: bool) -> ExitCode {
     for line in shortfalls(&ended.report) {
         log("WARN", &line);

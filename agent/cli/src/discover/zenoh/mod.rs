@@ -1,7 +1,8 @@
 //! `rp discover --router`: requests the liveliness tokens of all nodes from a Zenoh router.
 //!
 //! The command opens a client session over one TCP connection for a few milliseconds. The session
-//! declares nothing and subscribes to nothing, so no node appears and other sessions receive nothing.
+//! declares nothing and subscribes to nothing, so no node appears and other sessions receive
+//! nothing.
 
 pub mod address;
 pub mod error;
@@ -140,9 +141,9 @@ pub fn run_conversation(
     let ended = conversation.listen(&mut session);
     // A peer that is not a router receives nothing more.
     if session.router().is_some() {
-        let said = conversation.send("goodbye (CLOSE)", &message::goodbye());
+        let sent = conversation.send("goodbye (CLOSE)", &message::goodbye());
         if ended.is_ok() {
-            said?;
+            sent?;
         }
     }
     ended?;

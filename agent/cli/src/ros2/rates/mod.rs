@@ -286,8 +286,8 @@ impl Rates {
         self.tick(now);
     }
 
-    /// Adds a message as [`Self::add_message`] does, with its number. A sampled message counts at the
-    /// time of the writer's timestamp, except for a delay. Messages between it and the writer's
+    /// Adds a message as [`Self::add_message`] does, with its number. A sampled message counts at
+    /// the time of the writer's timestamp, except for a delay. Messages between it and the writer's
     /// last one also count, at interpolated times.
     ///
     /// # Errors
@@ -402,7 +402,8 @@ impl Rates {
 
     /// Emits all periodic reports due up to this time.
     fn tick(&mut self, now: i64) {
-        if self.is_reported_at_message() || self.topics.iter().all(|one| one.message_type.is_none()) {
+        if self.is_reported_at_message() || self.topics.iter().all(|one| one.message_type.is_none())
+        {
             return;
         }
         let next = match self.next {

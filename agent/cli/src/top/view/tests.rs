@@ -231,7 +231,9 @@ fn the_screens_match_the_reviewed_texts() {
     };
     let imu = details(0);
     shown.selected = Some(key.clone());
-    shown.measured_topics.insert(key.clone(), MeasuredBy::Session);
+    shown
+        .measured_topics
+        .insert(key.clone(), MeasuredBy::Session);
     press(&mut shown, "\ne");
     shown.take(Fact::Details(key, Some(Box::new(imu))), now);
     compare("details-80x24", &screen(&mut shown, (80, 24), ASCII, now));

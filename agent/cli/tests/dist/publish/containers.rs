@@ -1,5 +1,5 @@
-//! podman runs the commands of `docs/containers.md`. One agent in a container observes a robot on the
-//! host. Others, on the host and in a sidecar, observe a robot in a container.
+//! podman runs the commands of `docs/containers.md`. One agent in a container observes a robot on
+//! the host. Others, on the host and in a sidecar, observe a robot in a container.
 
 use std::path::Path;
 use std::process::Command;
@@ -28,8 +28,8 @@ const PATIENCE: Duration = Duration::from_secs(30);
 /// Maximum time of the kernel to verify the programs.
 const READY: Duration = Duration::from_secs(60);
 
-/// Returns a stream of Fast DDS through shared memory, its default between processes of one host. Each
-/// test has a topic of its own, because the agents observe the whole host.
+/// Returns a stream of Fast DDS through shared memory, its default between processes of one host.
+/// Each test has a topic of its own, because the agents observe the whole host.
 fn stream(topic: &str) -> Stream {
     Stream {
         topic: topic.to_owned(),
@@ -41,9 +41,9 @@ fn stream(topic: &str) -> Stream {
     }
 }
 
-/// Starts a publisher and a subscriber behind a command prefix, and waits until all agents know both.
-/// Names are announced once in shared memory, and an agent on a busy machine may miss them: then the
-/// one in the container requests them, as the page describes.
+/// Starts a publisher and a subscriber behind a command prefix, and waits until all agents know
+/// both. Names are announced once in shared memory, and an agent on a busy machine may miss them:
+/// then the one in the container requests them, as the page describes.
 fn wait_discovered(
     podman: &Podman,
     enter: &[String],
@@ -97,8 +97,8 @@ fn counted(publisher: &mut Peer, topic: &str, agents: &[&Agent<'_>]) -> Result<(
     Ok(())
 }
 
-/// Makes the profile of the page in a directory, and returns the option for it. The default profile of
-/// podman 4.3 refuses `bpf`.
+/// Makes the profile of the page in a directory, and returns the option for it. The default profile
+/// of podman 4.3 refuses `bpf`.
 pub(super) fn seccomp(directory: &Path) -> Result<String> {
     let text = std::fs::read_to_string(page())?;
     let command = text.lines().find(|line| line.starts_with("jq "));
@@ -133,7 +133,8 @@ fn a_robot_on_the_host_is_observed_from_a_container() -> Result<()> {
         .with("--name", AGENT)
         .with("--security-opt", &seccomp(directory.path())?);
     let mut agent = start_in_container(&podman, &options, &host)?;
-    let (mut publisher, _subscriber) = wait_discovered(&podman, &memory.inside(&host), topic, &[&agent])?;
+    let (mut publisher, _subscriber) =
+        wait_discovered(&podman, &memory.inside(&host), topic, &[&agent])?;
     counted(&mut publisher, topic, &[&agent])?;
     let mut list = podman.command("exec");
     let list = succeed(list.args([AGENT, "rp", "topic", "list"]))?;

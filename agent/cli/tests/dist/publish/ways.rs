@@ -1,5 +1,5 @@
-//! Each way to get `rp`: from a fresh host to the first metric of a robot, and back to a host without
-//! a trace.
+//! Each way to get `rp`: from a fresh host to the first metric of a robot, and back to a host
+//! without a trace.
 //!
 //! The durations are printed. Nothing but the patience of a person limits them, because the machine
 //! may be busy.
@@ -18,7 +18,7 @@ use ros2probe_testing::harness::peer::robot;
 use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::wait_within;
 
-use super::containers::{start_in_container, seccomp};
+use super::containers::{seccomp, start_in_container};
 use super::podman::{Options, Podman};
 use super::repository::{ADDRESS, listen, serve};
 use super::{VERSION, package, published, succeed, tool};
@@ -113,8 +113,8 @@ struct FreshDebian {
 }
 
 impl FreshDebian {
-    /// Starts a host whose `/packages` is a copy of these files of the release. The repository is its
-    /// only source of packages.
+    /// Starts a host whose `/packages` is a copy of these files of the release. The repository is
+    /// its only source of packages.
     fn start(start: Start, files: &[PathBuf]) -> Result<Self> {
         let directory = tempfile::tempdir()?;
         serve(directory.path())?;
@@ -206,7 +206,7 @@ fn the_repository_for_apt() -> Result<()> {
 
 #[test]
 #[ignore = "looks at a release: make release"]
-fn the_package() -> Result<()> {
+fn the_package_measures_and_is_removed_without_a_trace() -> Result<()> {
     let own = match std::env::consts::ARCH {
         "aarch64" => package("arm64")?,
         _ => package("amd64")?,
@@ -221,7 +221,7 @@ fn the_package() -> Result<()> {
 
 #[test]
 #[ignore = "looks at a release: make release"]
-fn the_wheel() -> Result<()> {
+fn the_wheel_measures_and_is_removed_without_a_trace() -> Result<()> {
     let wheel = super::wheel::name(std::env::consts::ARCH);
     let fresh = FreshDebian::start(Start::Nothing, &[published()?.join(wheel)])?;
     let began = Instant::now();
@@ -241,7 +241,7 @@ fn the_wheel() -> Result<()> {
 
 #[test]
 #[ignore = "looks at a release: make release"]
-fn the_static_binary() -> Result<()> {
+fn the_static_binary_measures_and_is_removed_without_a_trace() -> Result<()> {
     let name = format!("rp-{VERSION}-{}", std::env::consts::ARCH);
     let fresh = FreshDebian::start(Start::Nothing, &[published()?.join(&name)])?;
     let began = Instant::now();
@@ -257,7 +257,7 @@ fn the_static_binary() -> Result<()> {
 
 #[test]
 #[ignore = "looks at a release: make release"]
-fn the_image() -> Result<()> {
+fn the_image_measures_and_is_removed_without_a_trace() -> Result<()> {
     let host = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let options = Options::documented("--network host")?

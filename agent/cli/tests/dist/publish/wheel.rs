@@ -85,9 +85,15 @@ fn installs_and_leaves_nothing(wheels: &Path) -> Result<()> {
     ensure!(files.contains("../../../bin/rp"), "{files}");
     let python = files.lines().filter(|file| file.ends_with(".py")).count();
     ensure!(python == 0, "{files}");
-    let said = upgrade(&environment.join("bin/rp"), wheels)?;
-    ensure!(said.contains("installed by a Python wheel in "), "{said}");
-    ensure!(said.contains("bin/python3 -m pip install /"), "{said}");
+    let printed = upgrade(&environment.join("bin/rp"), wheels)?;
+    ensure!(
+        printed.contains("installed by a Python wheel in "),
+        "{printed}"
+    );
+    ensure!(
+        printed.contains("bin/python3 -m pip install /"),
+        "{printed}"
+    );
     succeed(pip(&environment).args(["uninstall", "--yes", "ros2probe"]))?;
     ensure!(paths(&environment)? == before, "pip left files behind");
     Ok(())

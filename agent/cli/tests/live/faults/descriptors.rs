@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use anyhow::{Result, ensure};
 
-use super::{API_PORT, Counted, METRICS_PORT, FaultBench, ask, request};
+use super::{API_PORT, Counted, FaultBench, METRICS_PORT, ask, request};
 use ros2probe_testing::harness::agent::{ON_THE_WIRE, Scrape};
 use ros2probe_testing::harness::network::Link;
 use ros2probe_testing::harness::soak::{long, outcome};

@@ -13,7 +13,7 @@ use anyhow::{Context as _, Result, ensure};
 use ros2probe_capture::netns;
 use serde_json::Value;
 
-use super::clients::{RequestLoop, Clients, AgentAddresses, answer};
+use super::clients::{AgentAddresses, Clients, RequestLoop, answer};
 use super::memory::{PausingSender, UNUSED_PORT};
 use super::unit::{Allowance, UnitCgroups, mebibytes};
 use super::zenoh_storm::ZenohStorm;
@@ -165,7 +165,12 @@ struct PeakUsage {
 }
 
 /// Reads the values until everything is sent, and once more.
-fn observe(span: Duration, group: &UnitCgroups, doors: &AgentAddresses, real: &mut RealTraffic) -> Result<PeakUsage> {
+fn observe(
+    span: Duration,
+    group: &UnitCgroups,
+    doors: &AgentAddresses,
+    real: &mut RealTraffic,
+) -> Result<PeakUsage> {
     let began = Instant::now();
     let mut peak = 0;
     let (mut participants, mut endpoints, mut zenoh_aliases) = (0.0_f64, 0.0_f64, 0.0_f64);
@@ -175,7 +180,11 @@ fn observe(span: Duration, group: &UnitCgroups, doors: &AgentAddresses, real: &m
         if is_sent {
             real.wait_sent()?;
         }
-        ensure!(group.oom_kills()? == 0, "killed after {:?}", began.elapsed());
+        ensure!(
+            group.oom_kills()? == 0,
+            "killed after {:?}",
+            began.elapsed()
+        );
         peak = peak.max(group.needed()?);
         let page = page(doors)?;
         participants = participants.max(table_usage(&page, "participants"));
@@ -246,7 +255,8 @@ fn refusals_have_names(page: &Scrape) -> Result<()> {
 fn storms(link: &Link) -> Result<[Storm; 4]> {
     // An unoptimized agent processes fewer messages.
     let (pace, rest) = if long().is_some() { (2, 50) } else { (1, 200) };
-    let breathing = |count: u32| PausingSender::with_pauses(link, count * pace, Duration::from_millis(4));
+    let breathing =
+        |count: u32| PausingSender::with_pauses(link, count * pace, Duration::from_millis(4));
     let slow = PausingSender::with_pauses(link, 1, Duration::from_millis(rest))?;
     Ok([
         Storm::of_a_crowd(breathing(4)?, 1200, 12),
@@ -291,7 +301,12 @@ fn filled_bytes(page: &Scrape, table: &str) -> f64 {
 
 /// Ends a recording, and returns its number of messages of real topics. The report counts each
 /// other sent message with the reason, except those dropped before the agent knew their topic.
-fn end_recording(doors: &AgentAddresses, name: &str, real: &RealTraffic, is_all: bool) -> Result<u64> {
+fn end_recording(
+    doors: &AgentAddresses,
+    name: &str,
+    real: &RealTraffic,
+    is_all: bool,
+) -> Result<u64> {
     let path = format!("/recordings/{name}");
     let (status, ended) = socket_request(doors, "DELETE", &path, "")?;
     ensure!(status == 200, "{status} {ended}");
@@ -384,7 +399,7 @@ impl RealTraffic {
     /// itself loses no message.
     fn check(&self, page: &Scrape) -> Result<String> {
         let dropped = dropped(page);
-        let mut said = Vec::new();
+        let mut printed = Vec::new();
         for (topic, sent) in self.sent()? {
             let label = [("topic", topic)];
             let counted = page.sum("ros2_topic_messages_total", &label);
@@ -395,7 +410,7 @@ impl RealTraffic {
                 "{topic}: {counted} of {sent}, {lost} lost, {dropped} dropped: {}",
                 page.doubted_jumps()
             );
-            said.push(format!("{counted} of {sent} messages of {topic}"));
+            printed.push(format!("{counted} of {sent} messages of {topic}"));
         }
         let events = page.sum(
             "ros2probe_events_total",
@@ -408,7 +423,7 @@ impl RealTraffic {
         );
         Ok(format!(
             "{} counted, {dropped} records or frames dropped",
-            said.join(" and ")
+            printed.join(" and ")
         ))
     }
 }
@@ -443,7 +458,12 @@ fn well_behaved_clients(doors: &AgentAddresses) -> Vec<RequestLoop> {
 }
 
 /// Sends a request on the Unix socket, and returns the status and the answer.
-fn socket_request(doors: &AgentAddresses, method: &str, path: &str, body: &str) -> Result<(u16, Value)> {
+fn socket_request(
+    doors: &AgentAddresses,
+    method: &str,
+    path: &str,
+    body: &str,
+) -> Result<(u16, Value)> {
     let stream = UnixStream::connect(&doors.socket)?;
     stream.set_read_timeout(Some(Duration::from_secs(20)))?;
     ask(&mut { stream }, method, path, body)

@@ -45,7 +45,9 @@ impl Robot<'_, '_> {
         let (status, problem) = self.scene.ask("POST", "/recordings", &body)?;
         let detail = problem["detail"].as_str().unwrap_or_default();
         ensure!(
-            (500..600).contains(&status) && detail.contains(EIO) && began.elapsed() < MAX_RESPONSE_TIME,
+            (500..600).contains(&status)
+                && detail.contains(EIO)
+                && began.elapsed() < MAX_RESPONSE_TIME,
             "{status} {problem} after {:?}",
             began.elapsed()
         );

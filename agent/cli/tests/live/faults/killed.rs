@@ -13,7 +13,7 @@ use anyhow::{Context as _, Result, anyhow, ensure};
 use ros2probe_capture::netns;
 use serde_json::Value;
 
-use super::{Counted, PATIENCE, FaultBench, ask, launch};
+use super::{Counted, FaultBench, PATIENCE, ask, launch};
 use ros2probe_testing::forged::storm::Dice;
 use ros2probe_testing::forged::{Carrier as _, Sender, Talker};
 use ros2probe_testing::harness::agent::Agent;
@@ -147,7 +147,7 @@ impl Places {
 }
 
 #[test]
-fn an_agent_killed_at_any_moment_leaves_nothing_and_starts_clean() -> Result<()> {
+fn an_agent_killed_at_any_moment_restarts_without_leftovers() -> Result<()> {
     let seed = std::env::var(SEED).ok().and_then(|text| text.parse().ok());
     let random = || {
         std::time::UNIX_EPOCH

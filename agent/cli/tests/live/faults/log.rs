@@ -17,7 +17,8 @@ fn a_log_without_a_reader_delays_no_thread() -> Result<()> {
     let directory = tempfile::tempdir()?;
     let right = format!("watch: [/**]\n{ON_THE_WIRE}");
     let (mut reader, writer) = io::pipe()?;
-    let scene = FaultBench::start_until_output(&link.robot, &directory, &right, &[], writer.into())?;
+    let scene =
+        FaultBench::start_until_output(&link.robot, &directory, &right, &[], writer.into())?;
     let mut counted = Counted::start(&link, 1, "talker")?;
     counted.send_samples(320, 100)?;
 

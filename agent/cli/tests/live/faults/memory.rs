@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Result, ensure};
 
 use super::unit::{Allowance, UnitCgroups, mebibytes};
-use super::{API_PORT, Counted, PATIENCE, FaultBench};
+use super::{API_PORT, Counted, FaultBench, PATIENCE};
 use ros2probe_testing::forged::storm::{Storm, forgery};
 use ros2probe_testing::forged::{Carrier, Sender};
 use ros2probe_testing::harness::agent::ON_THE_WIRE;
@@ -137,7 +137,11 @@ fn storm(
     let began = Instant::now();
     let (mut peak, mut is_full) = (0, false);
     while began.elapsed() < span || !is_full {
-        ensure!(group.oom_kills()? == 0, "killed after {:?}", began.elapsed());
+        ensure!(
+            group.oom_kills()? == 0,
+            "killed after {:?}",
+            began.elapsed()
+        );
         peak = peak.max(group.needed()?);
         // A page of all entries needs memory, too.
         let page = scene.agent.scrape()?;

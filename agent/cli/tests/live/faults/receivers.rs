@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use anyhow::{Result, anyhow, ensure};
 
-use super::{API_PORT, Counted, METRICS_PORT, FaultBench};
+use super::{API_PORT, Counted, FaultBench, METRICS_PORT};
 use ros2probe_capture::netns;
 use ros2probe_testing::harness::agent::ON_THE_WIRE;
 use ros2probe_testing::harness::network::{Link, Namespace};
@@ -127,9 +127,9 @@ fn misbehaving_receivers_and_scrapers_are_counted_and_lose_no_message() -> Resul
     })?;
     let delivered = page.sum("ros2probe_otlp_exports_total", &[("outcome", "delivered")]);
     ensure!(delivered == 0.0, "{delivered} were taken by nobody");
-    let said = scene.log();
-    let lines = said.matches("refuses the export").count();
-    ensure!((2..=3).contains(&lines), "{said}");
+    let printed = scene.log();
+    let lines = printed.matches("refuses the export").count();
+    ensure!((2..=3).contains(&lines), "{printed}");
     let took = scene.end()?;
     drop(slow);
     let connections = (hanging.end()?, babbling.end()?);
@@ -147,7 +147,7 @@ fn misbehaving_receivers_and_scrapers_are_counted_and_lose_no_message() -> Resul
 }
 
 #[test]
-fn a_crowd_of_scrapers_and_clients_is_bounded_and_leaves_nothing_behind() -> Result<()> {
+fn many_scrapers_and_clients_are_bounded_and_leave_no_descriptor_open() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let configuration = format!("watch: [/**]\n{ON_THE_WIRE}");
@@ -188,10 +188,10 @@ fn a_crowd_of_scrapers_and_clients_is_bounded_and_leaves_nothing_behind() -> Res
         .args([env!("CARGO_BIN_EXE_rp"), "run", "--config"])
         .arg(directory.path().join("ros2probe.yaml"))
         .output()?;
-    let said = String::from_utf8_lossy(&second.stderr);
+    let printed = String::from_utf8_lossy(&second.stderr);
     ensure!(
-        second.status.code() == Some(1) && said.contains("cannot listen on 127.0.0.1:17400"),
-        "{:?} {said}",
+        second.status.code() == Some(1) && printed.contains("cannot listen on 127.0.0.1:17400"),
+        "{:?} {printed}",
         second.status
     );
 

@@ -58,10 +58,9 @@ impl Cell {
         );
         fault("not lost", named.difference(&self.lost).copied().collect());
         for cause in LossCause::ALL {
-            let wrong = self
-                .reported
-                .iter()
-                .filter(|(_, reported)| **reported == cause && !self.possible_causes.contains(&cause));
+            let wrong = self.reported.iter().filter(|(_, reported)| {
+                **reported == cause && !self.possible_causes.contains(&cause)
+            });
             let wrong = wrong.map(|(number, _)| *number).collect();
             fault(&format!("cannot be of {}", cause.label()), wrong);
         }

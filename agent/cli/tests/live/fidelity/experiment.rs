@@ -186,7 +186,7 @@ impl Experiment {
             "not all was sent"
         );
         // The sums settle while the peers run, and the lists once the peers have ended.
-        let doubts = sums_that_differ(&mut witness, &sent, &received)?;
+        let doubts = differing_sums(&mut witness, &sent, &received)?;
         let seen = witness.latest().context("no snapshot")?;
         let topic = self.size.stream().topic;
         let page = agent.as_ref().map(|agent| agent.settled_scrape(&topic, 0));
@@ -203,7 +203,7 @@ impl Experiment {
         for (subscriber, truth) in received.iter().enumerate() {
             let losses = reported(&testimony.delivery_losses, &seen, &sent.guid, &truth.guid)?;
             if let Some(page) = &page {
-                truth.ensure_on(page, &losses)?;
+                truth.check_page(page, &losses)?;
             }
             let missing = truth.missing(&sent.numbers);
             for (span, due) in spans.iter().zip(1..) {
@@ -315,7 +315,13 @@ impl Experiment {
     }
 
     /// Applies one fault while the next stretch is sent, until `due` samples are sent in total.
-    fn span(&self, trouble: InjectedFault, due: u64, link: &Link, peers: &mut Peers) -> Result<Span> {
+    fn span(
+        &self,
+        trouble: InjectedFault,
+        due: u64,
+        link: &Link,
+        peers: &mut Peers,
+    ) -> Result<Span> {
         let host = peers.host()?;
         let overflows = || Snmp::of(host)?.receive_buffer_errors();
         let before = overflows()?;
@@ -364,7 +370,7 @@ impl Experiment {
             InjectedFault::Datagrams(per_cent) => (per_cent, Part::Whole, None),
             InjectedFault::Fragments(per_cent) => (per_cent, Part::Trailing, None),
             InjectedFault::DatagramsToTheLast(per_cent) => {
-                (per_cent, Part::Whole, Some(peers.ports_of_the_last()?))
+                (per_cent, Part::Whole, Some(peers.last_ports()?))
             }
         };
         let length = match self.size {
@@ -387,11 +393,7 @@ impl Experiment {
 /// Waits until the agent has counted what each subscriber logged, and returns where the counts
 /// differ. A loss after the last received sample may be open until the writer ends, because a
 /// stopped subscriber may miss the last sample.
-fn sums_that_differ(
-    witness: &mut Witness,
-    sent: &Truth,
-    received: &[Truth],
-) -> Result<Vec<String>> {
+fn differing_sums(witness: &mut Witness, sent: &Truth, received: &[Truth]) -> Result<Vec<String>> {
     let mut doubts = Vec::new();
     for truth in received {
         let missing = truth.missing(&sent.numbers);
@@ -440,7 +442,7 @@ impl Peers {
     }
 
     /// Returns the ports that only the last subscriber has.
-    fn ports_of_the_last(&self) -> Result<Vec<String>> {
+    fn last_ports(&self) -> Result<Vec<String>> {
         let mut sockets = self
             .subscribers
             .iter()
@@ -503,18 +505,18 @@ impl Truth {
     }
 
     /// Checks that an agent's page has the same counts for this reader.
-    fn ensure_on(&self, page: &Scrape, losses: &BTreeMap<u64, LossCause>) -> Result<()> {
+    fn check_page(&self, page: &Scrape, losses: &BTreeMap<u64, LossCause>) -> Result<()> {
         let prefix = self.guid.get(..24).context("a short GUID")?;
         let subscriber = format!("participant {prefix}.000001c1");
-        let whose = ("subscriber", subscriber.as_str());
-        let received = page.sum("ros2_subscriber_received_messages_total", &[whose]);
+        let reader_label = ("subscriber", subscriber.as_str());
+        let received = page.sum("ros2_subscriber_received_messages_total", &[reader_label]);
         ensure!(
             received == self.numbers.len() as f64,
             "{received} on the page"
         );
         for cause in LossCause::ALL {
             let name = "ros2_subscriber_lost_messages_total";
-            let lost = page.sum(name, &[whose, ("cause", cause.label())]);
+            let lost = page.sum(name, &[reader_label, ("cause", cause.label())]);
             let reported = losses.values().filter(|each| **each == cause).count();
             ensure!(
                 lost == reported as f64,
@@ -541,13 +543,19 @@ pub(crate) fn sums(seen: &Snapshot, writer: &str, reader: &str) -> Delivered {
     let sockets = sockets_of(seen, reader);
     let mut sums = Delivered::default();
     for delivery in seen.topics.iter().flat_map(|topic| &topic.deliveries) {
-        let of_reader = delivery.readers.iter().any(|guid| is_same_cause(*guid, reader))
+        let of_reader = delivery
+            .readers
+            .iter()
+            .any(|guid| is_same_cause(*guid, reader))
             || delivery.readers.is_empty()
                 && delivery
                     .sockets
                     .iter()
                     .any(|socket| sockets.contains(socket));
-        if delivery.direction == Direction::Received && of_reader && is_same_cause(delivery.writer, writer) {
+        if delivery.direction == Direction::Received
+            && of_reader
+            && is_same_cause(delivery.writer, writer)
+        {
             sums.add(&delivery.delivered);
         }
     }
@@ -557,7 +565,8 @@ pub(crate) fn sums(seen: &Snapshot, writer: &str, reader: &str) -> Delivered {
 /// Returns the sockets at which a reader is known to receive.
 fn sockets_of(seen: &Snapshot, reader: &str) -> BTreeSet<u64> {
     let deliveries = seen.topics.iter().flat_map(|topic| &topic.deliveries);
-    let of_reader = deliveries.filter(|each| each.readers.iter().any(|guid| is_same_cause(*guid, reader)));
+    let of_reader =
+        deliveries.filter(|each| each.readers.iter().any(|guid| is_same_cause(*guid, reader)));
     of_reader.flat_map(|each| each.sockets.clone()).collect()
 }
 

@@ -6,7 +6,7 @@ use super::*;
 const MAX_ATTEMPTS_PER_PEER: u32 = 3;
 
 #[test]
-fn idle_garbage_truncated_and_foreign_files_do_no_harm() -> Result<()> {
+fn idle_malformed_truncated_and_foreign_files_are_ignored() -> Result<()> {
     let network = Namespace::isolated()?;
     let host = Host::new(&network)?;
     let directory = tempfile::tempdir()?;

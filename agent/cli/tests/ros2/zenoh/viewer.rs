@@ -7,7 +7,7 @@ use std::net::TcpStream;
 use anyhow::{Context as _, Result, ensure};
 use ros2probe_capture::netns;
 use ros2probe_testing::harness::network::Namespace;
-use ros2probe_testing::viewer::{ServerMessage, SUBPROTOCOLS, open};
+use ros2probe_testing::viewer::{SUBPROTOCOLS, ServerMessage, open};
 use sha2::{Digest as _, Sha256};
 
 use crate::counting::{PATIENCE, publisher, subscription};
@@ -45,7 +45,9 @@ fn a_viewer_receives_point_clouds_byte_for_byte() -> Result<()> {
     let mut hashes = Vec::new();
     while hashes.len() < COUNT {
         match viewer.next_within(PATIENCE)?.context("no message")? {
-            ServerMessage::Data(data) if data.subscription == id => hashes.push(hash(&data.payload)?),
+            ServerMessage::Data(data) if data.subscription == id => {
+                hashes.push(hash(&data.payload)?)
+            }
             ServerMessage::Status(status) => anyhow::bail!("{}", status.message),
             _ => {}
         }

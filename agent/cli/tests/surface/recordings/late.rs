@@ -36,13 +36,13 @@ fn a_recording_warns_early_and_repeatedly_of_writers_without_a_topic() {
     recording.wait_for("Recording...");
     let first = recording.wait_for(&format!("not recorded: {MISSED}"));
     assert!(first < Duration::from_secs(3), "{first:?}");
-    let line = recording.said.last().unwrap();
+    let line = recording.printed.last().unwrap();
     assert!(line.contains("[WARN]") && line.ends_with(REMEDY), "{line}");
     let again = recording.wait_for("not recorded: 1 writer is active");
     assert!(again > Duration::from_secs(5), "{again:?}");
     recording.signal("-INT");
     let (status, _) = recording.end();
-    assert_eq!(status.code(), Some(0), "{:#?}", recording.said);
+    assert_eq!(status.code(), Some(0), "{:#?}", recording.printed);
 
     // In a recording of known topics, nothing is missing.
     let mut command = rp();
@@ -54,9 +54,9 @@ fn a_recording_warns_early_and_repeatedly_of_writers_without_a_topic() {
     recording.signal("-INT");
     recording.wait_for("Completing the bag");
     assert!(
-        recording.said.iter().all(|line| !line.contains(MISSED)),
+        recording.printed.iter().all(|line| !line.contains(MISSED)),
         "{:#?}",
-        recording.said
+        recording.printed
     );
 }
 

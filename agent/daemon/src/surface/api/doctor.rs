@@ -81,7 +81,10 @@ async fn examine(
 ) -> Result<Json<Report>, Problem> {
     let doctor = context.doctor.clone();
     let answers = own_answers(&context, granted).await?;
-    let report = run_blocking(&EXAMINATION_PERMIT, EXAMINATION_TIMEOUT, move || (doctor.0)(&answers)).await;
+    let report = run_blocking(&EXAMINATION_PERMIT, EXAMINATION_TIMEOUT, move || {
+        (doctor.0)(&answers)
+    })
+    .await;
     report.map(Json).map_err(|no_result| match no_result {
         NoResult::Late => Problem::new(Code::Ending, "the examination of this host does not end"),
         NoResult::Ending => ending(),

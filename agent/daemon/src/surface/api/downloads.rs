@@ -111,8 +111,8 @@ async fn download(
 
 /// All files of a recording
 ///
-/// The answer is a tar archive with the bag's directory. It has the lengths of the files at the time
-/// of the request; data appended later are not included.
+/// The answer is a tar archive with the bag's directory. It has the lengths of the files at the
+/// time of the request; data appended later are not included.
 #[utoipa::path(
     get,
     path = "/recordings/{name}/archive",

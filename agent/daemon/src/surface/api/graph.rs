@@ -129,7 +129,13 @@ impl GraphBuilder {
     }
 
     /// Adds a service or action with its edges, unless it has no endpoints.
-    fn add_service_or_action(&mut self, kind: VertexKind, domain_id: u32, name: &str, parties: &Parties<'_>) {
+    fn add_service_or_action(
+        &mut self,
+        kind: VertexKind,
+        domain_id: u32,
+        name: &str,
+        parties: &Parties<'_>,
+    ) {
         if parties.is_empty() {
             return;
         }

@@ -176,7 +176,10 @@ fn ros2_daemon(figures: &Ros2DaemonFigures) -> Vec<health::Ros2DaemonPort> {
 
 fn abilities(agent: &AgentFacts) -> Vec<health::Ability> {
     let view = |ability: Ability| {
-        let reason = agent.missing_abilities.iter().find(|(blind, _)| *blind == ability);
+        let reason = agent
+            .missing_abilities
+            .iter()
+            .find(|(blind, _)| *blind == ability);
         health::Ability {
             ability: ability.label().into(),
             able: agent.abilities.contains(&ability),

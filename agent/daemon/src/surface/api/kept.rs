@@ -29,7 +29,12 @@ pub(super) fn kept(root: &Path, known: &BTreeSet<String>) -> Vec<KeptBag> {
 }
 
 /// Returns the bags among this number of entries. `before` is an earlier list.
-fn bags_among(root: &Path, known: &BTreeSet<String>, most: usize, before: &[KeptBag]) -> Vec<KeptBag> {
+fn bags_among(
+    root: &Path,
+    known: &BTreeSet<String>,
+    most: usize,
+    before: &[KeptBag],
+) -> Vec<KeptBag> {
     let entries = fs::read_dir(root).into_iter().flatten();
     let bags = entries.take(most).filter_map(|entry| {
         let entry = entry.ok()?;

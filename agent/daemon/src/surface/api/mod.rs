@@ -187,7 +187,10 @@ fn nouns(context: Option<&Context>) -> OpenApiRouter<Context> {
     };
     let needs = |read, change, routes: OpenApiRouter<Context>| {
         let needs = Needs { read, change };
-        routes.layer(middleware::from_fn_with_state(needs, security::require_rights))
+        routes.layer(middleware::from_fn_with_state(
+            needs,
+            security::require_rights,
+        ))
     };
     OpenApiRouter::with_openapi(openapi::head())
         .merge(needs(Access::Read, Access::Watch, watch::routes()))

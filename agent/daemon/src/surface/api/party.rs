@@ -112,7 +112,9 @@ pub(super) fn action_type(message_type: &str) -> Option<&str> {
         "_GetResult_Request",
         "_GetResult_Response",
     ];
-    ACTION_ENDS.iter().find_map(|end| message_type.strip_suffix(end))
+    ACTION_ENDS
+        .iter()
+        .find_map(|end| message_type.strip_suffix(end))
 }
 
 #[cfg(test)]

@@ -9,7 +9,7 @@ use axum::serve::Listener;
 use tokio::io::DuplexStream;
 use tokio::sync::mpsc;
 
-use super::security::{AccessRules, Rights, Kind};
+use super::security::{AccessRules, Kind, Rights};
 use super::{Context, router};
 use crate::config::Access;
 

@@ -15,7 +15,7 @@ use axum::serve::Listener;
 use tokio::task::JoinSet;
 
 use super::problem::{Code, MEDIA_TYPE, Problem, ProblemBody};
-use super::security::{AccessRules, Rights, Kind, Token, TokenError};
+use super::security::{AccessRules, Kind, Rights, Token, TokenError};
 use super::{Context, router};
 use crate::config::{Access, Limit};
 use crate::surface::limited_listener::{LimitedListener, Refusal};
@@ -268,9 +268,9 @@ fn lock(path: &Path) -> Result<File, OpenError> {
     }
 }
 
-/// Changes the group of the socket to [`SOCKET_GROUP`] if the agent runs as root and the group exists.
-/// Under the service manager, the agent already has that group. Otherwise the socket keeps the
-/// agent's own group.
+/// Changes the group of the socket to [`SOCKET_GROUP`] if the agent runs as root and the group
+/// exists. Under the service manager, the agent already has that group. Otherwise the socket keeps
+/// the agent's own group.
 fn give_to_group(path: &Path) {
     let groups = fs::read_to_string("/etc/group").unwrap_or_default();
     let group = groups.lines().find_map(|line| {

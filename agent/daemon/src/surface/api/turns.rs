@@ -51,6 +51,9 @@ mod tests {
         assert_eq!(hanging.await, Err(NoResult::Late));
         assert_eq!(run_blocking(&TURNS, short, || 7).await, Err(NoResult::Late));
         drop(end);
-        assert_eq!(run_blocking(&TURNS, Duration::from_secs(60), || 7).await, Ok(7));
+        assert_eq!(
+            run_blocking(&TURNS, Duration::from_secs(60), || 7).await,
+            Ok(7)
+        );
     }
 }

@@ -48,8 +48,8 @@ struct Of {
     /// ROS name of a topic or node; by default all.
     name: Option<String>,
     /// Calls of these callbacks are late if they take or wait longer than this, until ten seconds
-    /// after the last request. Without it, the bound is `max_latency_ms` of the topic. Without that,
-    /// it is three times the 99th percentile of the callback's calls.
+    /// after the last request. Without it, the bound is `max_latency_ms` of the topic. Without
+    /// that, it is three times the 99th percentile of the callback's calls.
     #[param(minimum = 0, maximum = 3_600_000)]
     above_ms: Option<f64>,
     /// Only late calls of the last seconds; by default all that are known.
@@ -85,7 +85,9 @@ async fn show(
         .map(|above| number_in_range("above_ms", above, LONGEST_MS));
     let above = above.transpose()?;
     let above = above.map(|above| Duration::from_secs_f64(above / 1e3));
-    let last = of.last_s.map(|last| number_in_range("last_s", last, LONGEST_S));
+    let last = of
+        .last_s
+        .map(|last| number_in_range("last_s", last, LONGEST_S));
     let last = last.transpose()?.map(Duration::from_secs_f64);
     context.latest.request_late_calls(of.name.as_deref(), above);
     let state = context.state().await;

@@ -52,7 +52,9 @@ pub(super) fn accept(request: &Request) -> Result<Response, HandshakeError> {
         && has(CONNECTION, "upgrade")
         && has(UPGRADE, "websocket")
         && has(SEC_WEBSOCKET_VERSION, WEBSOCKET_VERSION);
-    let key = key.filter(|_| is_websocket).ok_or(HandshakeError::NoWebSocket)?;
+    let key = key
+        .filter(|_| is_websocket)
+        .ok_or(HandshakeError::NoWebSocket)?;
     let mut offered = words(headers, &SEC_WEBSOCKET_PROTOCOL);
     let spoken = offered.find_map(|offered| SUBPROTOCOLS.into_iter().find(|ours| *ours == offered));
     let spoken = spoken.ok_or(HandshakeError::Subprotocol)?;
@@ -84,7 +86,10 @@ impl IntoResponse for HandshakeError {
                 let headers = [
                     close,
                     (UPGRADE, HeaderValue::from_static("websocket")),
-                    (SEC_WEBSOCKET_VERSION, HeaderValue::from_static(WEBSOCKET_VERSION)),
+                    (
+                        SEC_WEBSOCKET_VERSION,
+                        HeaderValue::from_static(WEBSOCKET_VERSION),
+                    ),
                 ];
                 let text = "This port speaks the Foxglove WebSocket protocol. Open its address, \
                             with ws:// in front, in Foxglove, Lichtblick or PlotJuggler.\n";

@@ -36,7 +36,7 @@ use tokio_util::task::TaskTracker;
 use super::api;
 use super::api::page::Page;
 use super::api::problem::{Code, Problem};
-use super::api::security::{AccessRules, Rights, Kind, Token, TokenError};
+use super::api::security::{AccessRules, Kind, Rights, Token, TokenError};
 use super::connection::{Connection, ConnectionState};
 use super::limited_listener::{LimitedListener, Refusal};
 use super::listen::listen;

@@ -176,7 +176,9 @@ pub fn parse(text: &str) -> Result<Request, Malformed> {
             .map_err(|_| Malformed),
         "subscribeConnectionGraph" => Ok(Request::SubscribeGraph),
         "unsubscribeConnectionGraph" => Ok(Request::UnsubscribeGraph),
-        other => Ok(Request::Unsupported(other.chars().take(MAX_SHOWN_OP).collect())),
+        other => Ok(Request::Unsupported(
+            other.chars().take(MAX_SHOWN_OP).collect(),
+        )),
     }
 }
 
@@ -223,7 +225,10 @@ mod tests {
             assert_eq!(parse(&format!(r#"{{"op":"{op}","id":"x"}}"#)), Ok(expected));
         }
         let long = format!(r#"{{"op":"{}"}}"#, "é".repeat(1_000));
-        assert_eq!(parse(&long), Ok(Request::Unsupported("é".repeat(MAX_SHOWN_OP))));
+        assert_eq!(
+            parse(&long),
+            Ok(Request::Unsupported("é".repeat(MAX_SHOWN_OP)))
+        );
     }
 
     #[test]

@@ -168,7 +168,11 @@ mod tests {
             ("Python-xmlrpc/3.11", Jazzy),
             ("curl/8", Jazzy),
         ] {
-            assert_eq!(chosen_dialect(None, None, python(agent), hash), expected, "{agent}");
+            assert_eq!(
+                chosen_dialect(None, None, python(agent), hash),
+                expected,
+                "{agent}"
+            );
         }
         assert_eq!(
             chosen_dialect(None, None, python("Python-xmlrpc/3.11"), &[]),

@@ -83,7 +83,8 @@ impl ConnectionState {
         self.resets.store(true, Ordering::Relaxed);
     }
 
-    /// Waits until the connection must end: on request, or after [`IDLE_TIMEOUT`] without an answer.
+    /// Waits until the connection must end: on request, or after [`IDLE_TIMEOUT`] without an
+    /// answer.
     pub(super) async fn ended(&self) {
         loop {
             let deadline = self.since() + IDLE_TIMEOUT;

@@ -119,7 +119,10 @@ impl Ros2DaemonFigures {
 
     /// Returns the number of requests by function.
     pub fn requests(&self) -> impl Iterator<Item = (&'static str, u64)> {
-        let names = ALL.iter().map(|function| function.name).chain([UNKNOWN_LABEL]);
+        let names = ALL
+            .iter()
+            .map(|function| function.name)
+            .chain([UNKNOWN_LABEL]);
         names
             .zip(&self.requests)
             .map(|(name, count)| (name, count.load(Ordering::Relaxed)))

@@ -239,7 +239,10 @@ mod tests {
         assert_eq!(state(), PortState::Occupied);
         drop(other);
         ports.update(&domains, start + TAKEOVER_DELAY);
-        ports.update(&domains, start + TAKEOVER_DELAY * 2 - Duration::from_millis(1));
+        ports.update(
+            &domains,
+            start + TAKEOVER_DELAY * 2 - Duration::from_millis(1),
+        );
         // No process listens, so `ros2 daemon stop` ends.
         assert!(std::net::TcpStream::connect(address).is_err());
         ports.update(&domains, start + TAKEOVER_DELAY * 2);

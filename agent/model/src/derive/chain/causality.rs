@@ -123,7 +123,9 @@ impl Causality {
             let end = hop.points.last().map(|point| point.published);
             hop.domain_id == *domain_id
                 && hop.topics.last().is_some_and(|(topic, _)| topic == input)
-                && end.is_some_and(|end| end <= *input_source && *input_source - end <= MAX_WRITE_DELAY)
+                && end.is_some_and(|end| {
+                    end <= *input_source && *input_source - end <= MAX_WRITE_DELAY
+                })
         };
         let mut latest = self.publications.iter_mut().rev().take(MAX_SEARCHED);
         let before = latest.find(is_origin);

@@ -9,8 +9,8 @@
 //! - Several remaining candidates are ambiguous, and none of them counts.
 //! - A stamp that originates at several nodes is shared, and is not evidence.
 //!
-//! A hop is accepted after [`MIN_MATCHES`] matches, if the node's output mostly has the stamp of some
-//! input and the input is hardly ever late.
+//! A hop is accepted after [`MIN_MATCHES`] matches, if the node's output mostly has the stamp of
+//! some input and the input is hardly ever late.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
@@ -184,7 +184,8 @@ impl Evidence {
     /// that of an input.
     pub(super) fn restamping(&self, rates: &Rates<'_>) -> Vec<Diagnosis> {
         let restamped = self.outputs.iter().filter_map(|((topic, node), counts)| {
-            let enough = counts.outputs >= MIN_RESTAMPED_OUTPUTS && counts.aged >= MIN_RESTAMPED_OUTPUTS;
+            let enough =
+                counts.outputs >= MIN_RESTAMPED_OUTPUTS && counts.aged >= MIN_RESTAMPED_OUTPUTS;
             let most = |count: u32, of: u32| u64::from(count) * 10 >= u64::from(of) * 9;
             let is_new = most(counts.own, counts.outputs) && most(counts.fresh, counts.aged);
             if !enough || !is_new || counts.matched > 0 {

@@ -242,7 +242,10 @@ impl Progress {
     }
 
     fn state(&self, chain: &ExpectedChain, now: Timestamp) -> ChainState {
-        let recent = self.recent.iter().filter(|(last, _)| *last + EVALUATION_WINDOW > now);
+        let recent = self
+            .recent
+            .iter()
+            .filter(|(last, _)| *last + EVALUATION_WINDOW > now);
         let latency = Quantiles::of(recent.map(|(last, first)| *last - *first));
         let Some(latency) = latency else {
             return ChainState::Idle;

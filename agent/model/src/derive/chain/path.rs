@@ -139,7 +139,8 @@ impl Paths {
                 self.paths.insert(Arc::clone(&path), progress);
             }
             if self.paths.is_full() {
-                self.paths.retain(|_, known| known.last + IDLE_TIMEOUT > last);
+                self.paths
+                    .retain(|_, known| known.last + IDLE_TIMEOUT > last);
             }
             if self.paths.is_full() && !self.paths.contains_key(&path) {
                 self.paths.refuse();
@@ -169,7 +170,10 @@ impl Paths {
 
     /// Returns the chains with enough messages.
     pub(super) fn shown(&self) -> Vec<ChainFacts> {
-        let shown = self.paths.iter().filter(|(_, each)| each.count >= MIN_MESSAGES);
+        let shown = self
+            .paths
+            .iter()
+            .filter(|(_, each)| each.count >= MIN_MESSAGES);
         let chains = shown.map(|(path, progress)| ChainFacts {
             path: Arc::clone(path),
             count: progress.count,

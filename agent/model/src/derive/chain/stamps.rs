@@ -21,8 +21,8 @@ use crate::facts::tables::{
 
 /// Time without a message after which the messages of a stamp are evaluated.
 pub(super) const EVALUATION_SILENCE: Duration = Duration::from_secs(2);
-/// Time after which the messages of a stamp are evaluated even if more may follow. Longer chains are
-/// not recognized.
+/// Time after which the messages of a stamp are evaluated even if more may follow. Longer chains
+/// are not recognized.
 pub(super) const MAX_CHAIN_DURATION: Duration = Duration::from_secs(5);
 /// Time for which later messages of an evaluated stamp are ignored.
 const EVALUATED_STAMP_LIFETIME: Duration = Duration::from_secs(10);
@@ -198,7 +198,8 @@ impl Messages {
             let Some(waiting) = stamps.get_mut(key) else {
                 return false;
             };
-            if now - waiting.last >= EVALUATION_SILENCE || now - waiting.first >= MAX_CHAIN_DURATION {
+            if now - waiting.last >= EVALUATION_SILENCE || now - waiting.first >= MAX_CHAIN_DURATION
+            {
                 let group = waiting.group.take();
                 open.sub(group.as_ref().map_or(0, |each| each.messages.len()));
                 due.extend(group);

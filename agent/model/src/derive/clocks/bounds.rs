@@ -7,7 +7,8 @@ use ros2probe_wire::time::nanoseconds;
 use crate::facts::model_time::ModelTime;
 use crate::facts::wall_clock::WallClock;
 
-/// A bound widens by one nanosecond in this many: 100 ppm, for two clocks that drift by 50 ppm each.
+/// A bound widens by one nanosecond in this many: 100 ppm, for two clocks that drift by 50 ppm
+/// each.
 const DRIFT_DIVISOR: i64 = 10_000;
 /// Time in which the fastest message and the fastest round trip are found.
 const WINDOW: Duration = Duration::from_secs(10);
@@ -19,8 +20,8 @@ const ROUND_TRIP_TIMEOUT: Duration = Duration::from_secs(600);
 const MAX_STAMPING_DELAY: i64 = 500_000;
 /// Messages among which one is expected to be as fast as a round trip.
 const MIN_MESSAGES: u32 = 20;
-/// Several messages of each second, all later than the fastest one by `MIN_STEP` nanoseconds, show a
-/// step back of the clock or another path.
+/// Several messages of each second, all later than the fastest one by `MIN_STEP` nanoseconds, show
+/// a step back of the clock or another path.
 const MIN_LATE_MESSAGES: u32 = 5;
 const MIN_STEP: i64 = 100_000_000;
 /// Number of such seconds. Old messages for a late joiner arrive within one.
@@ -252,7 +253,9 @@ impl Evidence {
 
     /// Returns the fastest round trip of the last window that had one.
     fn known_trip(&self, now: ModelTime) -> Option<i64> {
-        let known = self.known_trip.filter(|(_, at)| now - *at < ROUND_TRIP_TIMEOUT);
+        let known = self
+            .known_trip
+            .filter(|(_, at)| now - *at < ROUND_TRIP_TIMEOUT);
         known.map(|(time, _)| time)
     }
 
@@ -323,10 +326,15 @@ mod tests {
     }
 
     #[test]
-    fn a_second_with_old_messages_for_a_late_joiner_is_no_step() {
+    fn a_second_with_old_messages_for_a_late_joiner_is_not_a_step() {
         let mut evidence = Evidence::default();
         seconds(&mut evidence, 1..100, 1, 0);
-        seconds(&mut evidence, 100..101, 2 * MIN_LATE_MESSAGES, -3_600_000_000_000);
+        seconds(
+            &mut evidence,
+            100..101,
+            2 * MIN_LATE_MESSAGES,
+            -3_600_000_000_000,
+        );
         seconds(&mut evidence, 101..110, 1, 0);
         assert_eq!(evidence.steps(), 0);
         seconds(

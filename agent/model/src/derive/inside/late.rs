@@ -94,7 +94,9 @@ impl LateCalls {
     pub(super) fn judge(&mut self, at: ModelTime) -> bool {
         let mut has_changed = false;
         for lateness in self.callbacks.values_mut() {
-            let found = lateness.most_frequent_cause(at).map(|(_, calls)| (calls, 0));
+            let found = lateness
+                .most_frequent_cause(at)
+                .map(|(_, calls)| (calls, 0));
             has_changed |= lateness.alarm.judge(found);
         }
         has_changed
@@ -107,7 +109,9 @@ impl LateCalls {
             Some((lateness, calls))
         });
         raised.filter_map(move |(lateness, calls)| {
-            let ((stage, cause), _) = lateness.most_frequent_cause(at).or_else(|| lateness.last())?;
+            let ((stage, cause), _) = lateness
+                .most_frequent_cause(at)
+                .or_else(|| lateness.last())?;
             let of_cause = |example: &&Arc<LateExample>| {
                 let main = example.main.as_ref();
                 main.is_some_and(|main| (main.stage, main.cause) == (stage, cause))
@@ -165,13 +169,13 @@ impl Lateness {
         if let Some(part) = main {
             let Part { stage, cause, .. } = part;
             *self.causes.entry((stage, cause)).or_default() += 1;
-            let culprit = call.named_by(part);
+            let thread_of_part = call.named_by(part);
             Arc::make_mut(&mut self.history).push_back(LateEntry {
                 at: started,
                 stage,
                 cause,
                 total: call.total(),
-                other_thread: culprit.map(OtherThread::label),
+                other_thread: thread_of_part.map(OtherThread::label),
             });
         }
         let example = Arc::new(LateExample {

@@ -138,7 +138,10 @@ impl Diagnostics {
         let mut values = Vec::new();
         let mut bytes = 0;
         for (key, value) in status.values.clone().take(MAX_STATUS_VALUES) {
-            let (key, value) = (truncated_text(key, MAX_NAME), truncated_text(value, MAX_TEXT));
+            let (key, value) = (
+                truncated_text(key, MAX_NAME),
+                truncated_text(value, MAX_TEXT),
+            );
             bytes += key.len() + value.len();
             if bytes > self.value_bytes.room() {
                 self.value_bytes.refuse();

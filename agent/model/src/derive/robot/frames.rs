@@ -8,7 +8,7 @@ use foldhash::HashMap;
 use ros2probe_wire::{DomainId, Guid, header};
 
 use super::text::truncated_text;
-use super::transforms::{NAME, MAX_NAMED, Transforms, without_slash};
+use super::transforms::{MAX_NAMED, NAME, Transforms, without_slash};
 use crate::facts::bounded::{Bounded, Counted, TableFacts};
 use crate::facts::diagnosis::Diagnosis;
 use crate::facts::model_time::ModelTime;
@@ -75,7 +75,9 @@ impl Frames {
         let mut unknown: BTreeMap<(DomainId, &Arc<str>), Vec<&TopicName>> = BTreeMap::new();
         for writer in self.writers.values_mut() {
             let frame = writer.frame.as_ref().filter(|frame| !frame.is_empty());
-            let Some(frame) = frame.filter(|frame| transforms.is_unknown_frame(writer.domain_id, frame)) else {
+            let Some(frame) =
+                frame.filter(|frame| transforms.is_unknown_frame(writer.domain_id, frame))
+            else {
                 writer.unknown = None;
                 continue;
             };

@@ -296,7 +296,8 @@ impl Parameters {
         };
         for (index, name) in names.enumerate() {
             let name = truncated_text(name?, MAX_NAME).into();
-            self.requested_values.push_back(RequestedParameter { call, index, name });
+            self.requested_values
+                .push_back(RequestedParameter { call, index, name });
         }
         Ok(())
     }
@@ -369,7 +370,8 @@ impl Parameters {
     /// Returns who requested a change to this value.
     fn requester(&self, key: &Key, value: Option<&Arc<str>>, at: ModelTime) -> Option<Requester> {
         let latest = self.requests.iter().rev();
-        let mut recent = latest.filter(|request| request.at <= at && at - request.at <= MAX_EFFECT_DELAY);
+        let mut recent =
+            latest.filter(|request| request.at <= at && at - request.at <= MAX_EFFECT_DELAY);
         let removal = text(&ParameterValue::NotSet);
         let cause = recent
             .find(|request| request.key == *key && request.value == *value.unwrap_or(&removal));

@@ -169,8 +169,8 @@ impl Transforms {
         }
     }
 
-    /// Returns whether the domain has transforms, and none of them has this frame. A static one that
-    /// was sent before the agent started may have it.
+    /// Returns whether the domain has transforms, and none of them has this frame. A static one
+    /// that was sent before the agent started may have it.
     pub(super) fn is_unknown_frame(&self, domain_id: DomainId, frame: &str) -> bool {
         let of_domain = || self.trees.iter().filter(|tree| tree.domain_id == domain_id);
         let mut unread = self.broadcasters.values();

@@ -17,8 +17,8 @@ impl LateCall {
     /// [`Self::total`].
     ///
     /// The sums are those of the scheduler's accounting. The events divide them: events can get
-    /// lost, and the accounting cannot. Only the CPU time is that of the events, if none is missing:
-    /// the accounting counts it by ticks.
+    /// lost, and the accounting cannot. Only the CPU time is that of the events, if none is
+    /// missing: the accounting counts it by ticks.
     #[must_use]
     pub fn parts(&self) -> Vec<Part> {
         let mut parts = self.wait_parts();
@@ -233,7 +233,9 @@ impl LateCall {
                 // The rest precedes an earlier call, and has no events.
                 let runnable = self.activity_before.as_ref()?.runnable;
                 let is_most = runnable * 2 >= part.duration;
-                is_most.then(|| self.longest_other_thread(part.stage)).flatten()
+                is_most
+                    .then(|| self.longest_other_thread(part.stage))
+                    .flatten()
             }
             Cause::Runnable => self.longest_other_thread(part.stage),
             Cause::Stopped if part.stage != Stage::Callback => {

@@ -236,7 +236,9 @@ fn have_common_partition(one: &Qos, other: &Qos) -> bool {
         let default = qos.partitions.is_empty().then_some("");
         qos.partitions.iter().map(AsRef::as_ref).chain(default)
     }
-    names(one).any(|one| names(other).any(|other| matches_pattern(one, other) || matches_pattern(other, one)))
+    names(one).any(|one| {
+        names(other).any(|other| matches_pattern(one, other) || matches_pattern(other, one))
+    })
 }
 
 /// Returns whether `name`, which is not a pattern, matches a name or a pattern of `*` and `?`.
@@ -402,7 +404,7 @@ mod tests {
     }
 
     #[test]
-    fn two_zenoh_endpoints_match_whatever_their_qos() {
+    fn two_zenoh_endpoints_match_with_any_qos() {
         let (mut writer, mut reader) = (qos(Role::Writer), qos(Role::Reader));
         writer.reliability = Reliability::BEST_EFFORT;
         reader.reliability = Reliability::RELIABLE;

@@ -118,7 +118,8 @@ impl Victims {
             list.sort_unstable_by(|one, other| other.cmp(one));
             list.shrink_to(MAX_CANDIDATES);
         }
-        self.search_after = now + SEARCH_INTERVAL.max(SEARCH_TIME_PER_ENTRY.saturating_mul(visited));
+        self.search_after =
+            now + SEARCH_INTERVAL.max(SEARCH_TIME_PER_ENTRY.saturating_mul(visited));
     }
 
     /// Returns the next entry to evict for the new one.
@@ -127,8 +128,8 @@ impl Victims {
         // A packet since the search makes an entry active again.
         let is_silent = |victim: &Victim| {
             let participant = discovery.participants.get(&victim.guid.prefix);
-            let heard = participant.map(|participant| participant.last_seen);
-            heard == Some(victim.last_seen) && victim.guid.prefix != guid.prefix
+            let last_seen_now = participant.map(|participant| participant.last_seen);
+            last_seen_now == Some(victim.last_seen) && victim.guid.prefix != guid.prefix
         };
         self.silent.truncate(last(&self.silent, is_silent));
         if let Some(victim) = self.silent.pop_if(|victim| victim.priority <= priority) {

@@ -41,7 +41,9 @@ impl Zenoh {
     /// Returns the receiving socket of a direction on the loopback interface, if its session is
     /// known; else 0.
     pub(super) fn receiving_socket(&self, stream: &StreamId) -> u64 {
-        let other = self.opposite_of_flow(stream).filter(|_| stream.is_loopback());
+        let other = self
+            .opposite_of_flow(stream)
+            .filter(|_| stream.is_loopback());
         let owned = other.filter(|(place, direction)| direction.owner(place).is_some());
         owned.map_or(0, |(place, _)| place.socket)
     }

@@ -34,7 +34,9 @@ impl Declared {
             self.ids.insert(direction, id, token, 0);
         }
         if !self.directions.contains(&(token, direction))
-            && self.tokens.insert(direction, token, (), INDEX_BYTES_PER_TOKEN)
+            && self
+                .tokens
+                .insert(direction, token, (), INDEX_BYTES_PER_TOKEN)
         {
             self.directions.insert((token, direction));
         }

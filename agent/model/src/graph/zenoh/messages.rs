@@ -96,7 +96,12 @@ impl Zenoh {
     }
 
     /// Passes the request of a service's client to `show`.
-    fn request(&self, place: Place<'_>, request: &Request<'_>, show: &mut impl FnMut(ReportFact<'_>)) {
+    fn request(
+        &self,
+        place: Place<'_>,
+        request: &Request<'_>,
+        show: &mut impl FnMut(ReportFact<'_>),
+    ) {
         let Some(attachment) = request.query.attachment.and_then(read_attachment) else {
             return;
         };
@@ -193,7 +198,9 @@ impl Zenoh {
             direction.note_source(session);
             match (before, direction.owner(stream)) {
                 (None, Some(owner)) => show(ReportFact::Owner(stream.socket, owner.guid_prefix())),
-                (Some(owner), None) => show(ReportFact::Disowned(stream.socket, owner.guid_prefix())),
+                (Some(owner), None) => {
+                    show(ReportFact::Disowned(stream.socket, owner.guid_prefix()))
+                }
                 _ => {}
             }
         }

@@ -169,7 +169,9 @@ impl Zenoh {
     /// Removes tokens that a router forwarded before but omits from its complete answer to a new
     /// session.
     pub(super) fn remove_omitted_tokens(&mut self, stream: &StreamId, interest: u32) {
-        let asked = self.opposite(stream).and_then(|opposite| opposite.requested_interest);
+        let asked = self
+            .opposite(stream)
+            .and_then(|opposite| opposite.requested_interest);
         let Some((_, domain)) = asked.filter(|(id, _)| *id == interest) else {
             return;
         };

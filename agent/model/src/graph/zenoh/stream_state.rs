@@ -169,7 +169,9 @@ impl StreamState {
 
     /// Returns the session that sends, as far as is known.
     pub(super) fn session(&self) -> Option<ZenohId> {
-        let presumed = self.presumed.filter(|(_, count)| *count >= MIN_PUBLICATIONS_OF_SENDER);
+        let presumed = self
+            .presumed
+            .filter(|(_, count)| *count >= MIN_PUBLICATIONS_OF_SENDER);
         let is_certain = !self.is_ambiguous && !self.may_be_router && !self.is_router;
         let presumed = presumed.filter(|_| is_certain);
         self.sender
@@ -257,7 +259,11 @@ impl StreamState {
         let captured = fragment.bytes.captured;
         let is_whole_so_far = chain.bytes.len() == chain.length;
         chain.length += fragment.bytes.length;
-        let most = if chain.is_wanted { MAX_MESSAGE } else { MAX_HEAD };
+        let most = if chain.is_wanted {
+            MAX_MESSAGE
+        } else {
+            MAX_HEAD
+        };
         if is_whole_so_far {
             let kept = most.saturating_sub(chain.bytes.len());
             chain.append(captured.get(..kept).unwrap_or(captured), room);

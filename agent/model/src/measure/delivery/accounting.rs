@@ -99,7 +99,8 @@ impl Accounting<'_> {
         }
     }
 
-    /// Counts samples without a known cause. A gap within one TCP connection was left by the sender.
+    /// Counts samples without a known cause. A gap within one TCP connection was left by the
+    /// sender.
     fn locate(&mut self, first: SequenceNumber, last: SequenceNumber) {
         let from = self.in_order_from.max(first);
         if from > first {
@@ -130,12 +131,17 @@ impl Accounting<'_> {
     }
 
     /// Settles a pending sample as lost by this cause.
-    pub(super) fn explain(&mut self, cause: LossCause, number: SequenceNumber) {
+    pub(super) fn set_cause(&mut self, cause: LossCause, number: SequenceNumber) {
         self.count(|tally| tally.pending = tally.pending.saturating_sub(1));
         self.add_loss(cause, number, number);
     }
 
-    pub(super) fn add_loss(&mut self, cause: LossCause, first: SequenceNumber, last: SequenceNumber) {
+    pub(super) fn add_loss(
+        &mut self,
+        cause: LossCause,
+        first: SequenceNumber,
+        last: SequenceNumber,
+    ) {
         let count = last - first + 1;
         self.count(|tally| tally.add_lost(cause, count));
         let loss = DeliveryLoss {

@@ -4,9 +4,9 @@ use ros2probe_wire::SequenceNumber;
 
 use super::Delivery;
 use super::DeliveryContext;
-use super::START_GRACE;
-use super::SILENCE;
 use super::MAX_TRANSIT_TIME;
+use super::SILENCE;
+use super::START_GRACE;
 use crate::facts::model_time::ModelTime;
 
 impl Delivery {
@@ -25,7 +25,9 @@ impl Delivery {
             return;
         }
         let since = *self.waiting.get_or_insert(context.now);
-        let mut until = alive.map_or(ModelTime::ZERO, |alive| alive.min(context.now - MAX_TRANSIT_TIME));
+        let mut until = alive.map_or(ModelTime::ZERO, |alive| {
+            alive.min(context.now - MAX_TRANSIT_TIME)
+        });
         if !self.presumed_lost && since + SILENCE <= context.now {
             self.presumed_lost = true;
             until = until.max(since + START_GRACE);
@@ -47,7 +49,7 @@ impl Delivery {
         }
     }
 
-    /// Excuses samples that were written before the receiver's reader appeared. `next` and
+    /// Marks samples irrelevant that were written before the receiver's reader appeared. `next` and
     /// `advanced` describe the sequence before the current observation.
     pub(super) fn mark_unread_irrelevant(&mut self, (next, advanced): (SequenceNumber, ModelTime)) {
         let sequence = self.reception.sequence_mut();

@@ -148,7 +148,10 @@ mod tests {
         assert_eq!(addresses.owner(&at(7411)), Some(BOB));
         assert_eq!(addresses.owner(&at(8999)), Some(ALICE));
         assert_eq!(addresses.owner(&at(8000)), None);
-        assert_eq!((addresses.ages.len(), addresses.by_participant.len()), (17, 17));
+        assert_eq!(
+            (addresses.ages.len(), addresses.by_participant.len()),
+            (17, 17)
+        );
     }
 
     #[test]
@@ -163,7 +166,10 @@ mod tests {
         assert_eq!(addresses.owner(&at(7411)), Some(BOB));
         addresses.retain(|prefix| *prefix == BOB);
         assert_eq!(size(&addresses).0, 1);
-        assert_eq!((addresses.ages.len(), addresses.by_participant.len()), (1, 1));
+        assert_eq!(
+            (addresses.ages.len(), addresses.by_participant.len()),
+            (1, 1)
+        );
     }
 
     #[test]

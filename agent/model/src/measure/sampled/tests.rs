@@ -130,19 +130,31 @@ fn a_heartbeat_reveals_unseen_samples_and_a_gap_those_never_sent() {
     let mut view = View::new();
     let now = ModelTime::from_nanoseconds(view.now);
     assert_eq!(
-        view.sampled
-            .note_existing(SequenceNumber(7), MAX_ANNOUNCED_JUMP, now, &mut view.sequence),
+        view.sampled.note_existing(
+            SequenceNumber(7),
+            MAX_ANNOUNCED_JUMP,
+            now,
+            &mut view.sequence
+        ),
         0
     );
     view.receive(5);
     assert_eq!(
-        view.sampled
-            .note_existing(SequenceNumber(7), MAX_ANNOUNCED_JUMP, now, &mut view.sequence),
+        view.sampled.note_existing(
+            SequenceNumber(7),
+            MAX_ANNOUNCED_JUMP,
+            now,
+            &mut view.sequence
+        ),
         2
     );
     assert_eq!(
-        view.sampled
-            .note_existing(SequenceNumber(6), MAX_ANNOUNCED_JUMP, now, &mut view.sequence),
+        view.sampled.note_existing(
+            SequenceNumber(6),
+            MAX_ANNOUNCED_JUMP,
+            now,
+            &mut view.sequence
+        ),
         0
     );
     assert_eq!(view.counts(), (1, 3));
@@ -162,9 +174,12 @@ fn a_heartbeat_reveals_unseen_samples_and_a_gap_those_never_sent() {
     assert_eq!((update.samples, update.alike), (1, 4));
     view.receive(7);
     assert_eq!(view.counts(), (3, 5));
-    let forged = view
-        .sampled
-        .note_existing(SequenceNumber(1 << 40), MAX_ANNOUNCED_JUMP, now, &mut view.sequence);
+    let forged = view.sampled.note_existing(
+        SequenceNumber(1 << 40),
+        MAX_ANNOUNCED_JUMP,
+        now,
+        &mut view.sequence,
+    );
     assert_eq!((forged, view.counts()), (0, (3, 5)));
     assert_eq!(view.losses(), []);
 }
@@ -186,8 +201,12 @@ fn a_late_sample_that_a_heartbeat_announced_is_not_a_restart() {
     view.receive(1);
     let now = ModelTime::from_nanoseconds(view.now);
     assert_eq!(
-        view.sampled
-            .note_existing(SequenceNumber(5), MAX_ANNOUNCED_JUMP, now, &mut view.sequence),
+        view.sampled.note_existing(
+            SequenceNumber(5),
+            MAX_ANNOUNCED_JUMP,
+            now,
+            &mut view.sequence
+        ),
         4
     );
     view.now += SECOND;
@@ -222,8 +241,12 @@ fn an_unseen_message_is_reported_once_after_the_arrival_timeout() {
     // Neither a part of a sample nor a HEARTBEAT makes it seen.
     view.part(6, Completeness::Partial);
     let now = ModelTime::from_nanoseconds(view.now);
-    view.sampled
-        .note_existing(SequenceNumber(8), MAX_ANNOUNCED_JUMP, now, &mut view.sequence);
+    view.sampled.note_existing(
+        SequenceNumber(8),
+        MAX_ANNOUNCED_JUMP,
+        now,
+        &mut view.sequence,
+    );
     // Numbers skipped by a GAP are not missing.
     view.sampled.skip(
         (SequenceNumber(9), SequenceNumber(200)),
@@ -268,7 +291,9 @@ fn a_jump_beyond_all_windows_causes_bounded_work_and_no_loss() {
         view.receive(number);
     }
     // Each counts alone until the jump is confirmed; then the skipped numbers count, too.
-    let samples: Vec<_> = (1..=6).map(|n| view.receive(1_000_000 + n).samples).collect();
+    let samples: Vec<_> = (1..=6)
+        .map(|n| view.receive(1_000_000 + n).samples)
+        .collect();
     assert_eq!(samples, [1, 1, 1, 1, 999_995, 1]);
     assert_eq!(view.losses(), []);
     view.receive(u64::MAX);
@@ -294,9 +319,12 @@ fn a_forged_number_far_ahead_counts_as_one_message_and_affects_no_other() {
     assert!(view.part(6, Completeness::Complete).finished);
     assert_eq!(view.receive(7).samples, 1);
     let now = ModelTime::from_nanoseconds(view.now);
-    let messages = view
-        .sampled
-        .note_existing(SequenceNumber(3000), MAX_TRUSTED_JUMP, now, &mut view.sequence);
+    let messages = view.sampled.note_existing(
+        SequenceNumber(3000),
+        MAX_TRUSTED_JUMP,
+        now,
+        &mut view.sequence,
+    );
     let passed = view.sampled.skip(
         (SequenceNumber(2000), SequenceNumber(3000)),
         MAX_TRUSTED_JUMP,

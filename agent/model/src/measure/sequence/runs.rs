@@ -3,10 +3,10 @@
 use ros2probe_wire::{SequenceNumber, Timestamp};
 
 use super::MAX_ANNOUNCED_JUMP;
-use super::MIN_INCARNATION_GAP;
 use super::MAX_JUMP;
-use super::RunMembership;
 use super::MAX_STALE;
+use super::MIN_INCARNATION_GAP;
+use super::RunMembership;
 use super::Sequence;
 use super::Settled;
 use super::unconfirmed::{REQUIRED_CONFIRMATIONS, Run};
@@ -78,7 +78,8 @@ impl Sequence {
         let is_young = self.followed < REQUIRED_CONFIRMATIONS;
         // The source time of a number above `newest` is unknown: it arrived by another route.
         let is_repeated = || number <= self.newest && self.has(number);
-        newer && (is_repeated() || continues()) || is_young && self.next - number > MAX_ANNOUNCED_JUMP
+        newer && (is_repeated() || continues())
+            || is_young && self.next - number > MAX_ANNOUNCED_JUMP
     }
 
     /// Marks an unconfirmed sample as whole. Returns whether that is new.

@@ -139,7 +139,7 @@ impl Sequence {
         }
     }
 
-    /// Excuses `start..end`, so that no number in it is lost.
+    /// Marks `start..end` irrelevant, so that no number in it is lost.
     pub fn mark_irrelevant(&mut self, start: SequenceNumber, end: SequenceNumber) {
         let start = start.max(self.floor()).max(self.settled);
         self.irrelevant.set_all(start, end.min(self.next));

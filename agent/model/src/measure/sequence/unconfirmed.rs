@@ -109,8 +109,8 @@ impl UnconfirmedRun {
             && (is_ahead || next < live)
     }
 
-    /// Returns whether a HEARTBEAT at least [`COPY_WINDOW`] ago had the same lastSN, or one lower by at
-    /// most `reach`.
+    /// Returns whether a HEARTBEAT at least [`COPY_WINDOW`] ago had the same lastSN, or one lower
+    /// by at most `reach`.
     pub(super) fn is_claimed(&mut self, next: SequenceNumber, reach: u64, now: ModelTime) -> bool {
         let (claimed, at) = self.claim;
         let is_same = claimed > SequenceNumber::ZERO

@@ -325,7 +325,7 @@ fn intervals_between_messages_are_measured_exactly() {
 }
 
 #[test]
-fn samples_sent_elsewhere_before_a_reader_existed_here_are_not_lost() {
+fn samples_sent_to_other_hosts_before_a_local_reader_existed_are_not_lost() {
     let mut bench = Bench::new(Traits::default());
     bench.data(1).data(2).wait(60_000);
     bench.opened = ModelTime::from_nanoseconds(bench.now);
@@ -670,7 +670,11 @@ fn a_sample_in_transit_when_uprobes_begin_is_counted() {
 fn a_sample_in_transit_when_uprobes_begin_is_not_captured_if_a_part_is_missing() {
     let records = thirds();
     let looked = [in_shared_memory(records[0])];
-    let exact: Vec<_> = records[2..].iter().copied().map(with_intra_process).collect();
+    let exact: Vec<_> = records[2..]
+        .iter()
+        .copied()
+        .map(with_intra_process)
+        .collect();
     let fewest = every_sample_is_counted_or_missed(&looked, &exact, |_| {}, false);
     assert_eq!(fewest, [0, 1, 1, 1]);
 }

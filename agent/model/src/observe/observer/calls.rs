@@ -19,8 +19,8 @@ impl Observer {
         }
     }
 
-    /// Keeps a captured response of `get_type_description`, or a reply of the TypeLookup service, once
-    /// it is whole.
+    /// Keeps a captured response of `get_type_description`, or a reply of the TypeLookup service,
+    /// once it is whole.
     pub(super) fn keep_type_source(
         &mut self,
         found: &Found<'_>,

@@ -12,7 +12,7 @@ use super::MAX_CLOCK_STEP;
 use super::Observer;
 use super::TICK;
 use crate::facts::diagnosis;
-use crate::facts::event::{EventKind, MAX_TEXT, truncated, bounded_finding};
+use crate::facts::event::{EventKind, MAX_TEXT, bounded_finding, truncated};
 use crate::facts::loss_share::LossShare;
 use crate::facts::measurement::Measurement;
 use crate::facts::model_time::ModelTime;

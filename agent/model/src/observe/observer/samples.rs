@@ -136,7 +136,10 @@ impl Observer {
         let writer = sample.head.writer;
         if self.measure.payloads.needs_payload(writer) {
             let known = self.measure.profiler.get(writer);
-            let lacks = self.measure.payloads.is_undispatched(writer, sample.sequence_number);
+            let lacks = self
+                .measure
+                .payloads
+                .is_undispatched(writer, sample.sequence_number);
             if lacks || known.is_some_and(|known| !known.writer.has(sample)) {
                 self.measure.payloads.keep(sample, payload);
             }
@@ -168,7 +171,9 @@ impl Observer {
             ReadOutcome::Nothing | ReadOutcome::Decoded => {}
             ReadOutcome::Paused => self.apply_lists_to_latched(writer, sample.head.at),
             ReadOutcome::Transition(from, node) => self.note_transition(from, node),
-            ReadOutcome::Malformed(standard, error) => self.decode_error(standard.stage(), error.reason),
+            ReadOutcome::Malformed(standard, error) => {
+                self.decode_error(standard.stage(), error.reason)
+            }
         }
     }
 

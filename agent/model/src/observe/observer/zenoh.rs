@@ -50,7 +50,9 @@ impl Observer {
         zenoh.report(report, at, wants_bytes, &mut |shown| match shown {
             ReportFact::Sample(sample) => self.zenoh_sample(report.stream, at, sample),
             ReportFact::Owner(socket, prefix) => self.graph.receivers.add_owner(socket, prefix),
-            ReportFact::Disowned(socket, prefix) => self.graph.receivers.remove_owner(socket, prefix),
+            ReportFact::Disowned(socket, prefix) => {
+                self.graph.receivers.remove_owner(socket, prefix)
+            }
             ReportFact::Alive(session) => alive = Some(session),
             ReportFact::Relayed(session) => {
                 self.graph
@@ -159,7 +161,9 @@ impl Observer {
                     self.learn_participant(&announcement, &origin);
                     // The sockets of a session without tokens are not remembered.
                     for socket in self.zenoh.sockets(announcement.guid.prefix) {
-                        self.graph.receivers.add_owner(socket, announcement.guid.prefix);
+                        self.graph
+                            .receivers
+                            .add_owner(socket, announcement.guid.prefix);
                     }
                 }
                 GraphChange::ParticipantGone(guid) => {
@@ -193,7 +197,9 @@ impl Observer {
         if announcement.role == Role::Writer {
             let before = unknown_guid(Gid(announcement.gid));
             self.measure.profiler.rename(before, announcement.guid);
-            self.measure.payloads.rename_unknown_writer(before, announcement.guid);
+            self.measure
+                .payloads
+                .rename_unknown_writer(before, announcement.guid);
             self.requested.interest.remove(before);
         }
     }

@@ -55,7 +55,8 @@ fn processes_without_a_reader_in_a_multicast_group_have_no_losses() {
     for other in 1..=11 {
         // Half of the participants are known by a socket that sends; the others never sent.
         let prefix = GuidPrefix([1, 0x10, 100 + other, 4, 5, 6, 7, 8, 9, 10, 11, 12]);
-        let socket = unknown_participant(&mut host, prefix, 7500 + u16::from(other)).multicast(other.into());
+        let socket =
+            unknown_participant(&mut host, prefix, 7500 + u16::from(other)).multicast(other.into());
         if other % 2 == 0 {
             host.owner(socket, prefix);
         }
@@ -208,7 +209,9 @@ fn a_process_whose_only_reader_is_incompatible_is_not_a_subscriber() {
 #[test]
 fn a_wire_source_has_no_delivery_without_a_reader_of_the_topic() {
     let mut host = Host::new();
-    let group = unknown_participant(&mut host, BOB, 7411).multicast(0).wire();
+    let group = unknown_participant(&mut host, BOB, 7411)
+        .multicast(0)
+        .wire();
     (1..=20).for_each(|number| send(&mut host, number, &[group]));
     assert!(host.deliveries().is_empty());
     host.subscribe(BOB, 4);

@@ -274,7 +274,7 @@ fn a_stopped_call_has_the_thread_that_continued_the_process() {
 }
 
 #[test]
-fn a_callback_of_another_thread_explains_the_wait_after_the_one_of_its_own() {
+fn a_wait_is_explained_by_the_last_callback_of_any_thread() {
     let mut late = call(states(100, 0, 0, 0));
     late.wait = Some(milliseconds(80));
     late.states_before = Some(states(1, 0, 0, 59));
@@ -380,7 +380,8 @@ fn a_wait_without_a_socket_is_divided_by_the_threads_that_passed_the_message() {
     assert_eq!(&*late.named_by(main).unwrap().name, "chromium");
     let send = late.parts()[0];
     assert_eq!(&*late.named_by(send).unwrap().name, "talker");
-    // The thread received it from the network, or a process that does not publish it woke the thread.
+    // The thread received it from the network, or a process that does not publish it woke the
+    // thread.
     late.handoff.as_mut().unwrap().sender = None;
     assert_eq!(parts(&late)[0], (Stage::Wait, Cause::Arrival, 20));
     // Nor is it known when that thread was woken.
@@ -389,7 +390,7 @@ fn a_wait_without_a_socket_is_divided_by_the_threads_that_passed_the_message() {
 }
 
 #[test]
-fn a_thread_that_was_awake_before_the_message_explains_nothing_earlier() {
+fn a_thread_awake_before_the_message_does_not_explain_earlier_waits() {
     let mut late = call_of_a_handoff();
     // The middleware's thread was busy with earlier messages.
     late.wait = Some(milliseconds(45));

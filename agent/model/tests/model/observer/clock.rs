@@ -122,8 +122,8 @@ fn an_agent_that_sleeps_until_the_next_decision_reports_every_event_in_time() {
             let now = world.now;
             world.observer.input(Input::Time(Timestamp(now)));
             rounds += 1;
-            let news = world.observer.drain().events.events.into_iter();
-            events.extend(news.map(|event| (event.at, format!("{:?}", event.kind), now)));
+            let new_events = world.observer.drain().events.events.into_iter();
+            events.extend(new_events.map(|event| (event.at, format!("{:?}", event.kind), now)));
         }
         (events, rounds)
     };

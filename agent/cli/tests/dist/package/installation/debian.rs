@@ -104,8 +104,8 @@ impl Debian {
         self.first
     }
 
-    /// Returns the command prefix that runs a program of this machine on the host's network and in a
-    /// control group of the host. systemd-nspawn names the root of these groups `payload`.
+    /// Returns the command prefix that runs a program of this machine on the host's network and in
+    /// a control group of the host. systemd-nspawn names the root of these groups `payload`.
     pub(crate) fn on_host_network(&self) -> Vec<String> {
         let enter = "mkdir -p \"$0\" && echo 0 >\"$0/cgroup.procs\" && exec \"$@\"";
         let group = self
@@ -170,11 +170,11 @@ impl Debian {
             let text = std::fs::read_to_string(&children)?;
             self.first = text.split_whitespace().next().map_or(Ok(0), str::parse)?;
             // A process that prepares the container precedes its first process, and soon ends.
-            let (is_up, said): (_, &[_]) = match start {
+            let (is_up, printed): (_, &[_]) = match start {
                 Start::Systemd => ("systemctl is-system-running", &["running", "degraded"]),
                 Start::Nothing => ("cat /proc/1/comm", &["(sd-stubinit)"]),
             };
-            Ok(self.first != 0 && said.contains(&self.text(is_up)?.trim()))
+            Ok(self.first != 0 && printed.contains(&self.text(is_up)?.trim()))
         })
     }
 }

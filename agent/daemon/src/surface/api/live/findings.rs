@@ -365,7 +365,10 @@ fn in_words(all: &FindingInputs<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
             domain_id,
             participants,
         } => {
-            let listed: Vec<_> = participants.iter().map(|guid| ends.owner_name(*guid)).collect();
+            let listed: Vec<_> = participants
+                .iter()
+                .map(|guid| ends.owner_name(*guid))
+                .collect();
             let text = format!(
                 "Participants with different addresses have one machine id, so they use only shared \
                  memory with each other: {}",
@@ -411,8 +414,11 @@ fn unmatched(
     ends: &Ends<'_>,
     [verb, counterpart]: [&str; 2],
 ) -> Finding {
-    let (who, why) = (ends.owner_name(endpoint), missing_counterpart(reason, counterpart));
-    let text = format!("{who} {verb} {}, and {why}", topic.name);
+    let (owner, why) = (
+        ends.owner_name(endpoint),
+        missing_counterpart(reason, counterpart),
+    );
+    let text = format!("{owner} {verb} {}, and {why}", topic.name);
     let about = format!("{}|{}|{endpoint}", topic.domain_id, topic.dds_name);
     let found = finding(kind, severity_of_unmatched(reason), &about, text);
     match reason {
@@ -503,8 +509,8 @@ impl<'a> Ends<'a> {
         }
     }
 
-    /// Returns the node of an endpoint. If no node announces it, those of its participant are named.
-    /// Without these, it is the GUID.
+    /// Returns the node of an endpoint. If no node announces it, those of its participant are
+    /// named. Without these, it is the GUID.
     fn owner_name(&self, guid: Guid) -> String {
         let endpoint = self.endpoints.get(&guid);
         if let Some(node) = endpoint.and_then(|endpoint| endpoint.node.as_ref()) {
@@ -619,14 +625,14 @@ mod tests {
             }),
             ..Snapshot::default()
         };
-        let who = |snapshot: &Snapshot| Ends::new(snapshot).owner_name(reader);
-        assert_eq!(who(&snapshot), "the participant of /lidar");
+        let owner = |snapshot: &Snapshot| Ends::new(snapshot).owner_name(reader);
+        assert_eq!(owner(&snapshot), "the participant of /lidar");
         snapshot.nodes.push(node("/imu"));
-        assert_eq!(who(&snapshot), "the participant of /lidar and /imu");
+        assert_eq!(owner(&snapshot), "the participant of /lidar and /imu");
         snapshot.nodes.push(node("/base"));
-        assert_eq!(who(&snapshot), "the participant of /lidar and 2 others");
+        assert_eq!(owner(&snapshot), "the participant of /lidar and 2 others");
         snapshot.nodes.clear();
-        assert_eq!(who(&snapshot), reader.to_string());
+        assert_eq!(owner(&snapshot), reader.to_string());
     }
 
     #[test]
@@ -688,7 +694,9 @@ mod tests {
             "{lacking:?}"
         );
         let reason = "the kernel is too old".to_owned();
-        agent.missing_abilities.push((Ability::SocketLosses, reason));
+        agent
+            .missing_abilities
+            .push((Ability::SocketLosses, reason));
         let both = text(&agent);
         assert_eq!(
             both[0],

@@ -1,5 +1,5 @@
-//! Findings about measured topics: expectations of watches, and losses. The texts contain limits and
-//! names, but no measured numbers: those change each second, and the page has them.
+//! Findings about measured topics: expectations of watches, and losses. The texts contain limits
+//! and names, but no measured numbers: those change each second, and the page has them.
 
 use std::cmp::Reverse;
 
@@ -128,8 +128,8 @@ fn main_loss_cause(topic: &TopicFacts) -> (&'static str, &'static str) {
     }
 }
 
-/// Returns when the current loss began. Pauses of up to [`LOSS_FLAG_SECONDS`] seconds do not end a loss. Returns
-/// `None` without a recent loss.
+/// Returns when the current loss began. Pauses of up to [`LOSS_FLAG_SECONDS`] seconds do not end a
+/// loss. Returns `None` without a recent loss.
 fn began(past: &Past, topic: u32) -> Option<f64> {
     let mut began = None;
     let mut pause = 0;

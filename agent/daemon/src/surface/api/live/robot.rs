@@ -20,8 +20,8 @@ pub(super) fn in_words(ids: &Ids, diagnosis: &Diagnosis) -> Finding {
             errors,
             text,
         } => {
-            let said = format!("{node} logged {errors} errors within a minute: {text}");
-            let found = of_node(kind, ids, (*domain_id, node), said);
+            let sentence = format!("{node} logged {errors} errors within a minute: {text}");
+            let found = of_node(kind, ids, (*domain_id, node), sentence);
             found.with_remedy(format!("`rp log {node} --level error` prints them"))
         }
         Diagnosis::DiagnosticError {

@@ -57,7 +57,12 @@ impl Part {
 
 impl SharedLines {
     /// Updates the lines to a new state; does nothing if the state is the current one.
-    pub(super) fn update(&mut self, state: &Arc<State>, past: &Arc<Past>, in_force: &Arc<ActiveWatches>) {
+    pub(super) fn update(
+        &mut self,
+        state: &Arc<State>,
+        past: &Arc<Past>,
+        in_force: &Arc<ActiveWatches>,
+    ) {
         let is_same = self
             .state
             .as_ref()
@@ -128,7 +133,10 @@ impl SharedLines {
         let unready = state.ready(Instant::now()).err();
         let unready = unready.map(|reason| reason.to_string());
         let abilities = Able::ALL.iter().map(|ability| {
-            let reason = agent.missing_abilities.iter().find(|(blind, _)| blind == ability);
+            let reason = agent
+                .missing_abilities
+                .iter()
+                .find(|(blind, _)| blind == ability);
             Ability(
                 ability.label().into(),
                 agent.abilities.contains(ability).into(),

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, HashMap};
 
 use super::super::history::{stored_precision, thousandths};
 use super::super::index::Index;
-use super::rate_steps::{Part, RateSteps, STEP_SECONDS, MAX_STEPS};
+use super::rate_steps::{MAX_STEPS, Part, RateSteps, STEP_SECONDS};
 use super::structure::{Ids, is_measured, is_shown};
 use crate::config::Watchlist;
 use ros2probe_api::live::{History, Row, Totals};
@@ -83,7 +83,11 @@ impl Figures<'_> {
         };
         let second = known.and_then(|known| last?.row(known));
         let latency = second.and_then(|second| second.latency());
-        let part = |place: usize| latency.and_then(|it| it.get(place).copied()).map(stored_precision);
+        let part = |place: usize| {
+            latency
+                .and_then(|it| it.get(place).copied())
+                .map(stored_precision)
+        };
         let at = measured.last_message;
         Row(
             id,
@@ -226,7 +230,9 @@ pub(super) fn recent_losses(past: &Past) -> HashMap<u32, u32> {
 /// Returns the rates of the last minutes for measured topics.
 pub(super) fn history(snapshot: &Snapshot, past: &Past, ids: &Ids) -> History {
     let seconds = past.seconds();
-    let first = seconds.len().saturating_sub((STEP_SECONDS * MAX_STEPS) as usize);
+    let first = seconds
+        .len()
+        .saturating_sub((STEP_SECONDS * MAX_STEPS) as usize);
     let steps = seconds.get(first..).unwrap_or_default();
     let steps = steps.chunks(STEP_SECONDS as usize);
     let topics = snapshot.topics.iter().filter_map(|topic| {

@@ -515,7 +515,7 @@ mod tests {
         let (mut missed, mut kept) = (0, Vec::new());
         while let Some(item) = subscription.try_next() {
             match item {
-                Item::Missed(news) => missed += news.samples,
+                Item::Missed(missed_run) => missed += missed_run.samples,
                 Item::Sample(sample) => kept.push(sample.sequence_number.0),
                 Item::Clock(_) | Item::End(_) => {}
             }

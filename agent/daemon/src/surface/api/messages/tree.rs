@@ -216,10 +216,16 @@ mod tests {
         body.push(0);
         let seen = parsed(&shown("uint8[] data\nstring text", &body));
         assert_eq!(seen["data"]["$length"], 1000);
-        assert_eq!(seen["data"]["$items"].as_array().unwrap().len(), MAX_ELEMENTS);
+        assert_eq!(
+            seen["data"]["$items"].as_array().unwrap().len(),
+            MAX_ELEMENTS
+        );
         assert_eq!(seen["data"]["$items"][63], 63);
         assert_eq!(seen["text"]["$length"], 2000);
-        assert_eq!(seen["text"]["$text"].as_str().unwrap().len(), MAX_CHARACTERS);
+        assert_eq!(
+            seen["text"]["$text"].as_str().unwrap().len(),
+            MAX_CHARACTERS
+        );
     }
 
     #[test]

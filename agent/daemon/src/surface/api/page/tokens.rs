@@ -70,7 +70,11 @@ mod tests {
         assert!(given.iter().all(|token| token.len() == 64));
         crate::tables::tests::assert_driven::<PageTokens>();
         assert!(!tokens.is_valid(given[0].as_bytes()), "the oldest has gone");
-        assert!(given[1..].iter().all(|token| tokens.is_valid(token.as_bytes())));
+        assert!(
+            given[1..]
+                .iter()
+                .all(|token| tokens.is_valid(token.as_bytes()))
+        );
         assert!(!tokens.is_valid(&given[1].as_bytes()[1..]));
         assert!(!tokens.is_valid(b""));
     }

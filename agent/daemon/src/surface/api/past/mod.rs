@@ -51,8 +51,8 @@ struct MomentQuery {
 
 /// Size and reach of the history on disk
 ///
-/// The agent writes it each minute (`page.history_bytes`): the figures of each measured topic and of
-/// the robot's processes, the events, and the state of the robot.
+/// The agent writes it each minute (`page.history_bytes`): the figures of each measured topic and
+/// of the robot's processes, the events, and the state of the robot.
 #[utoipa::path(
     get,
     path = "/history",

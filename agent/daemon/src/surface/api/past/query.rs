@@ -91,7 +91,9 @@ impl TimeRange {
     /// Fails if the end is before the begin, or a number is impossible.
     pub(in super::super) fn checked(self, now: u32) -> Result<Times, Problem> {
         let to = self.to.map_or(Ok(now), second)?;
-        let from = self.from.map_or(Ok(to.saturating_sub(DEFAULT_SPAN_SECONDS)), second)?;
+        let from = self
+            .from
+            .map_or(Ok(to.saturating_sub(DEFAULT_SPAN_SECONDS)), second)?;
         let span = to.checked_sub(from).filter(|span| *span > 0);
         let span = span.ok_or_else(|| invalid("`to` must be later than `from`"))?;
         let step = match self.step {
@@ -133,8 +135,8 @@ pub(super) fn now(context: &Context) -> u32 {
     seconds(context.latest.state().known().time())
 }
 
-/// Reads the store on another thread. A storage that hangs holds [`MAX_READERS`] threads, whatever the
-/// number of clients, and no client longer than [`READ_TIMEOUT`].
+/// Reads the store on another thread. A storage that hangs holds [`MAX_READERS`] threads, whatever
+/// the number of clients, and no client longer than [`READ_TIMEOUT`].
 ///
 /// # Errors
 /// Fails if no history is kept, if the storage does not answer, or if the agent stops.
@@ -148,7 +150,10 @@ pub(in super::super) async fn read_store<T: Send + 'static>(
     if !history.is_kept() {
         return Err(missing(none));
     }
-    let answer = run_blocking(&READER_PERMITS, READ_TIMEOUT, move || history.opened().map(read)).await;
+    let answer = run_blocking(&READER_PERMITS, READ_TIMEOUT, move || {
+        history.opened().map(read)
+    })
+    .await;
     match answer {
         Ok(answer) => answer.ok_or_else(|| missing(none)),
         Err(NoResult::Late) => Err(missing("the storage of the history does not answer")),

@@ -135,8 +135,8 @@ impl Minute {
         self.write();
     }
 
-    /// Waits until the working thread has published, which it does for readers only. Returns false if
-    /// the agent ends.
+    /// Waits until the working thread has published, which it does for readers only. Returns false
+    /// if the agent ends.
     fn wait_for_publication(&self, ended: &Receiver<()>) -> bool {
         let latest = &self.context.latest;
         let before = latest.past();

@@ -69,7 +69,11 @@ fn refused_requests_do_not_use_up_the_rate_of_admitted_clients() {
         ("authorization", "Bearer 0123456789abcdef"),
     ]);
     for (door, outsider, client) in [
-        (access_rules(Kind::Network(token())), HeaderMap::new(), right),
+        (
+            access_rules(Kind::Network(token())),
+            HeaderMap::new(),
+            right,
+        ),
         (
             access_rules(Kind::Loopback(None)),
             foreign,
@@ -130,7 +134,10 @@ fn loopback_grants_the_configured_rights_and_socket_and_token_grant_all() {
 
 #[test]
 fn requests_from_web_pages_of_other_origins_are_refused() {
-    for door in [access_rules(Kind::Loopback(None)), access_rules(Kind::Network(token()))] {
+    for door in [
+        access_rules(Kind::Loopback(None)),
+        access_rules(Kind::Network(token())),
+    ] {
         let host = ("host", "localhost:17401");
         let bearer = ("authorization", "Bearer 0123456789abcdef");
         let answer = |pair| refusal(&door, &[host, bearer, pair]);

@@ -199,7 +199,7 @@ fn all_tables_are_bounded() {
     }
     assert_eq!(chains.topics.len(), MAX_TOPICS);
     assert_eq!(chains.refused, 11);
-    let mut chains = RecordedChains::with_room(100);
+    let mut chains = RecordedChains::with_limit(100);
     for round in 0..100 {
         let stamp = START + round * 101_000_001 + 1;
         add(&mut chains, "/a", stamp, stamp + MILLISECOND, None);

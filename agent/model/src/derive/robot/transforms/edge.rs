@@ -255,7 +255,10 @@ impl Edge {
         if self.has_several(last, now) {
             return Some(TransformFaultKind::SeveralBroadcasters);
         }
-        if self.went_back.is_some_and(|at| now - at < BACKWARD_STAMP_LIFETIME) {
+        if self
+            .went_back
+            .is_some_and(|at| now - at < BACKWARD_STAMP_LIFETIME)
+        {
             return Some(TransformFaultKind::TimeWentBack);
         }
         let [earliest, ..] = self.jumped;
@@ -285,7 +288,10 @@ impl Edge {
             .iter()
             .filter(|each| match last.is_static {
                 true => now - each.since >= STATIC_DUPLICATE_DELAY,
-                false => now - each.at < DUPLICATE_BROADCASTER_WINDOW && each.at - each.since >= DUPLICATE_BROADCASTER_WINDOW,
+                false => {
+                    now - each.at < DUPLICATE_BROADCASTER_WINDOW
+                        && each.at - each.since >= DUPLICATE_BROADCASTER_WINDOW
+                }
             });
         at_work.count() > 1
     }
