@@ -48,8 +48,8 @@ impl FrameHeader {
         }
     }
 
-    /// Reads the header of a frame as [`Self::recognize`] does, from words in memory order: those
-    /// at offsets 0, 4, 12 and 14.
+    /// Reads the header of a frame as [`Self::recognize`] does, from words in memory order: those at
+    /// offsets 0, 4, 12 and 14.
     #[inline(always)]
     #[must_use]
     pub const fn of_words([magic, length, port, next]: [u32; 4]) -> Option<Self> {

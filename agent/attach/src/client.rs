@@ -17,7 +17,7 @@ use crate::functions::{Calls, Library};
 use crate::mapped::Use;
 use crate::message::{receive, send};
 use crate::request::{
-    Activity, Answer, MAX_PROCESSES, Means, Numbered, Place, REQUEST_TIMEOUT, Request,
+    Activity, Answer, AttachMethod, MAX_PROCESSES, Numbered, Place, REQUEST_TIMEOUT, Request,
 };
 use crate::server::Peer;
 use crate::server::answer::answer;
@@ -223,7 +223,7 @@ impl Broker {
     /// Fails if the broker refuses, or cannot be reached.
     pub fn attach(
         &mut self,
-        (calls, place, means): (Calls, Place, Means),
+        (calls, place, means): (Calls, Place, AttachMethod),
         programs: &[BorrowedFd<'_>],
     ) -> Result<(Vec<OwnedFd>, Vec<String>), BrokerError> {
         let mut attached = None;

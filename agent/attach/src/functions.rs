@@ -3,7 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::request::Means;
+use crate::request::AttachMethod;
 
 /// Names of Fast DDS's library: 2.x, 3.x. A version may follow.
 const FAST_DDS: [&str; 2] = ["libfastrtps.so", "libfastdds.so"];
@@ -151,9 +151,9 @@ impl Calls {
     /// Returns the number of programs that come with a request. With links, one program calls the
     /// others, except for shared memory.
     #[must_use]
-    pub fn expected(self, means: Means) -> usize {
+    pub fn expected(self, means: AttachMethod) -> usize {
         match (self.library(), means) {
-            (Library::Tracing, Means::Links) => 1,
+            (Library::Tracing, AttachMethod::Links) => 1,
             _ => self.programs().len(),
         }
     }
@@ -212,9 +212,9 @@ mod tests {
         let mut messages = Calls::Messages.programs();
         messages.retain(|(program, _)| *program != RECEPTION_PROGRAM.0);
         assert!(messages.iter().all(|each| callbacks.contains(each)));
-        assert_eq!(Calls::Callbacks.expected(Means::PerfEvents), 25);
-        assert_eq!(Calls::Callbacks.expected(Means::Links), 1);
-        assert_eq!(Calls::SharedMemory.expected(Means::Links), 2);
+        assert_eq!(Calls::Callbacks.expected(AttachMethod::PerfEvents), 25);
+        assert_eq!(Calls::Callbacks.expected(AttachMethod::Links), 1);
+        assert_eq!(Calls::SharedMemory.expected(AttachMethod::Links), 2);
     }
 
     #[test]
@@ -227,6 +227,6 @@ mod tests {
         let is_known = |each: &&str| functions.iter().any(|(_, function)| function == each);
         assert!(RUNTIME.iter().all(is_known));
         assert_eq!(Calls::Runtime.programs(), functions);
-        assert_eq!(Calls::Initialization.expected(Means::Links), 1);
+        assert_eq!(Calls::Initialization.expected(AttachMethod::Links), 1);
     }
 }

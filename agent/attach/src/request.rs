@@ -68,7 +68,7 @@ pub enum Request {
         /// The file.
         place: Place,
         /// Means of attaching.
-        means: Means,
+        means: AttachMethod,
     },
     /// Perf events that report which process maps a file, one for each CPU: [`Answer::Mappings`].
     Mappings,
@@ -103,7 +103,7 @@ pub enum Place {
 /// Means of attaching programs to functions.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Means {
+pub enum AttachMethod {
     /// One link for all functions of a library, since Linux 6.6. The cookie of a function is its
     /// index in [`Calls::programs`].
     Links,
@@ -111,7 +111,7 @@ pub enum Means {
     PerfEvents,
 }
 
-impl Means {
+impl AttachMethod {
     /// Returns the best means that this kernel has.
     #[must_use]
     pub fn of_this_kernel() -> Self {

@@ -306,8 +306,8 @@ impl State {
     /// Returns the state of the robot; empty until the first snapshot.
     #[must_use]
     pub fn known(&self) -> &Snapshot {
-        static NOTHING: LazyLock<Snapshot> = LazyLock::new(Snapshot::default);
-        self.snapshot.as_deref().unwrap_or(&NOTHING)
+        static EMPTY_SNAPSHOT: LazyLock<Snapshot> = LazyLock::new(Snapshot::default);
+        self.snapshot.as_deref().unwrap_or(&EMPTY_SNAPSHOT)
     }
 
     /// Checks whether the state describes the robot at `now`.

@@ -14,8 +14,7 @@ const COMPLETE: u32 = 0x1002;
 /// Discriminator of a TypeIdentifier that is the hash of a complete type.
 const EK_COMPLETE: u8 = 0xf2;
 
-/// Identity of a complete type in XTypes: the first 14 bytes of the MD5 of its TypeObject
-/// (7.3.1.2).
+/// Identity of a complete type in XTypes: the first 14 bytes of the MD5 of its TypeObject (7.3.1.2).
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct EquivalenceHash(pub [u8; 14]);
 
@@ -120,7 +119,7 @@ mod tests {
     }
 
     #[test]
-    fn other_text_is_not_a_hash() {
+    fn other_text_is_no_hash() {
         for text in ["", "XTYPES_", "XTYPES_c6e4", "c6e4e345af3a7e027f9fca899133"] {
             assert_eq!(EquivalenceHash::parse(text), None, "{text}");
         }

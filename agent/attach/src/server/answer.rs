@@ -13,7 +13,9 @@ use crate::functions::{Calls, Library};
 use crate::kernel;
 use crate::mapped::{Mapped, Use};
 use crate::open::open;
-use crate::request::{Activity, Answer, MAX_DESCRIPTORS, MAX_PROCESSES, Means, Place, Request};
+use crate::request::{
+    Activity, Answer, AttachMethod, MAX_DESCRIPTORS, MAX_PROCESSES, Place, Request,
+};
 
 /// Number of process ids in one packet.
 const IDS_PER_PACKET: usize = 4096;
@@ -123,7 +125,7 @@ fn activities(processes: &[u32], sink: Sink<'_>) -> io::Result<()> {
 
 fn attached(
     peer: Peer,
-    (calls, place, means): (Calls, &Place, Means),
+    (calls, place, means): (Calls, &Place, AttachMethod),
     given: &[OwnedFd],
     sink: Sink<'_>,
 ) -> io::Result<()> {

@@ -18,7 +18,7 @@ use super::{
     Filter, FilterError, FilterSettings, NO_DELIVERIES, OBJECT, UNUSED_MAP_ENTRIES, open,
     ring_size, take,
 };
-use crate::breakpoints::{Attached, Breakpoints, Means};
+use crate::breakpoints::{AttachMethod, Attached, Breakpoints};
 use crate::uprobe::attachments::Refusal;
 
 /// The loaded programs; their maps are in the [`Filter`] returned with them.
@@ -35,7 +35,7 @@ impl Filter {
     pub fn load_uprobe(
         settings: &FilterSettings,
         within: Option<u64>,
-        means: Means,
+        means: AttachMethod,
     ) -> Result<(Self, Probes), FilterError> {
         let mut sizes = vec![
             ("PIECES", ring_size(settings.piece_ring_bytes)),

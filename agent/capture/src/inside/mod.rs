@@ -31,7 +31,7 @@ use self::observation::Probes;
 use self::programs::Tables;
 use self::table::Round;
 use crate::bell::Bell;
-use crate::breakpoints::Means;
+use crate::breakpoints::AttachMethod;
 use crate::filter::{Deliveries, FilterError};
 use crate::settings::{InsideChoice, LateChoice};
 use crate::shm::directories::Scope;
@@ -116,7 +116,7 @@ impl Inside {
         let mut broker = uprobe::broker(broker)?;
         let within = cgroup.map(uprobe::inode).transpose()?;
         let has_callbacks = matches!(choice, InsideChoice::Full | InsideChoice::Auto);
-        let loaded = programs::load(has_callbacks, within, Means::of_this_kernel());
+        let loaded = programs::load(has_callbacks, within, AttachMethod::of_this_kernel());
         let (programs, mut tables) = loaded.map_err(|error| match error {
             FilterError::Program(_) if within.is_some() => UprobeError::InsideScope(error),
             error => error.into(),

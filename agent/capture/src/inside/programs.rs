@@ -21,7 +21,7 @@ use ros2probe_wire::inside::{Counter, Figures, Handle, Process, accounting, cloc
 use zerocopy::FromZeros as _;
 
 use crate::bpf;
-use crate::breakpoints::{self, Breakpoints, Dispatcher, Means};
+use crate::breakpoints::{self, AttachMethod, Breakpoints, Dispatcher};
 use crate::error_chain::Reason;
 use crate::filter::{Aligned, FilterError, absent_is_fine, failed, take};
 use crate::kernel_types::KernelTypes;
@@ -96,7 +96,7 @@ pub struct Attached {
 pub fn load(
     has_callbacks: bool,
     within: Option<u64>,
-    means: Means,
+    means: AttachMethod,
 ) -> Result<(Programs, Tables), FilterError> {
     let architecture = u32::from(cfg!(target_arch = "aarch64"));
     let offsets = accounting_offsets(KernelTypes::read().ok().as_ref());

@@ -173,7 +173,7 @@ impl ProcessTable {
                 self.late.push(*call);
             }
             Some(Item::Announcement(announcement)) => {
-                self.apply_announcement(&announcement, clocks, broker)
+                self.apply_announcement(&announcement, clocks, broker);
             }
             None => {}
         }

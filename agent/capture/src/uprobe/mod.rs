@@ -18,7 +18,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use self::search::{Facts, LibrarySearch};
-use super::breakpoints::Means;
+use super::breakpoints::AttachMethod;
 use super::filter::{Filter, FilterError, FilterSettings};
 use super::filter_reader::FilterReader;
 use super::reorder_buffer::ReorderBuffer;
@@ -66,9 +66,9 @@ pub enum UprobeError {
 /// for events of mapped files, and for reading mapped files of other users' processes. Perf events
 /// need the wider CAP_SYS_ADMIN on recent kernels.
 fn required_capabilities() -> [(CapabilitySet, &'static str); 2] {
-    let events = match Means::of_this_kernel() {
-        Means::Links => (CapabilitySet::PERFMON, "CAP_PERFMON"),
-        Means::PerfEvents => (CapabilitySet::SYS_ADMIN, "CAP_SYS_ADMIN"),
+    let events = match AttachMethod::of_this_kernel() {
+        AttachMethod::Links => (CapabilitySet::PERFMON, "CAP_PERFMON"),
+        AttachMethod::PerfEvents => (CapabilitySet::SYS_ADMIN, "CAP_SYS_ADMIN"),
     };
     [events, (CapabilitySet::SYS_PTRACE, "CAP_SYS_PTRACE")]
 }
@@ -148,7 +148,7 @@ impl Uprobe {
             ),
             ..FilterSettings::default()
         };
-        let loaded = Filter::load_uprobe(&settings, within, Means::of_this_kernel());
+        let loaded = Filter::load_uprobe(&settings, within, AttachMethod::of_this_kernel());
         let (filter, probes) = loaded.map_err(|error| match error {
             FilterError::Program(_) if within.is_some() => UprobeError::Scope(error),
             error => error.into(),

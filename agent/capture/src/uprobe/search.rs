@@ -471,7 +471,7 @@ mod tests {
     use super::super::attachments::{DETACH_DELAY, RETRY_DELAY};
     use super::super::processes::Use;
     use super::*;
-    use crate::breakpoints::Means;
+    use crate::breakpoints::AttachMethod;
     use crate::filter::{Filter, FilterSettings};
     use crate::tables::tests::assert_driven;
     use crate::tables::{Libraries, MappedLibraries};
@@ -507,9 +507,12 @@ mod tests {
         assert_driven::<MappedLibraries>();
         let process = std::process::id();
         let all = Processes::of(process, used.clone());
-        let (_filter, probes) =
-            Filter::load_uprobe(&FilterSettings::default(), None, Means::of_this_kernel())
-                .expect("loading the kernel filter needs root: run the tests with sudo");
+        let (_filter, probes) = Filter::load_uprobe(
+            &FilterSettings::default(),
+            None,
+            AttachMethod::of_this_kernel(),
+        )
+        .expect("loading the kernel filter needs root: run the tests with sudo");
         let mut attachments = attachments(probes, Arc::default());
         let (start, broker) = (Instant::now(), &mut Broker::here());
         attachments.follow(&all, start, broker);

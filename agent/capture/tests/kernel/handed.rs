@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Result, ensure};
 use ros2probe_attach::library;
-use ros2probe_capture::breakpoints::{Attached, Means};
+use ros2probe_capture::breakpoints::{AttachMethod, Attached};
 use ros2probe_capture::filter::{Filter, FilterSettings, Form, Probes};
 use ros2probe_capture::piece_assembler::PieceAssembler;
 use ros2probe_testing::forged::{SAMPLES_WRITER, Talker};
@@ -39,10 +39,10 @@ struct SharedMemorySender {
 
 impl SharedMemorySender {
     fn new(form: Form) -> Result<SharedMemorySender> {
-        Self::by(Means::of_this_kernel(), form)
+        Self::by(AttachMethod::of_this_kernel(), form)
     }
 
-    fn by(means: Means, form: Form) -> Result<SharedMemorySender> {
+    fn by(means: AttachMethod, form: Form) -> Result<SharedMemorySender> {
         let host = Namespace::isolated()?;
         let within = File::open(host.cgroup())?.metadata()?.ino();
         let (mut filter, probes) =
@@ -195,10 +195,10 @@ fn metered_records_equal_those_of_user_space() -> Result<()> {
 #[test]
 fn captured_messages_are_whole() -> Result<()> {
     for (means, form) in [
-        (Means::of_this_kernel(), Form::Whole),
-        (Means::of_this_kernel(), Form::List),
-        (Means::PerfEvents, Form::Whole),
-        (Means::PerfEvents, Form::List),
+        (AttachMethod::of_this_kernel(), Form::Whole),
+        (AttachMethod::of_this_kernel(), Form::List),
+        (AttachMethod::PerfEvents, Form::Whole),
+        (AttachMethod::PerfEvents, Form::List),
     ] {
         let mut handing = SharedMemorySender::by(means, form)?;
         let mut expected: Vec<Vec<u8>> = Vec::new();

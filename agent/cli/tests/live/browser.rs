@@ -500,7 +500,7 @@ fn views_of_nodes_and_topics_show_figures_from_inside_processes() -> Result<()> 
     let mut answers = |question: &str| {
         match question {
             "create" => filter.create()?,
-            "work" => filter.work()?,
+            "work" => filter.publish_messages()?,
             "usual" => filter.usual()?,
             "late" => filter.late()?,
             _ => return place.ask(question),

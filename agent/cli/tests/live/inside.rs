@@ -10,7 +10,7 @@ use anyhow::{Context as _, Result, ensure};
 use ros2probe_api::chains::ChainList;
 use ros2probe_api::inside::Inside;
 use ros2probe_api::why::{LateCallback, Why};
-use ros2probe_capture::breakpoints::Means;
+use ros2probe_capture::breakpoints::AttachMethod;
 use ros2probe_capture::netns;
 use ros2probe_capture::system::Clocks;
 use ros2probe_testing::harness::agent::Agent;
@@ -449,9 +449,9 @@ fn agent_with<'n>(
 /// Returns the maximum number of attached libraries. With perf events, detaching 64 would take
 /// longer than the unit allows; 8 are still more than a robot has.
 fn libraries() -> usize {
-    match Means::of_this_kernel() {
-        Means::Links => 64,
-        Means::PerfEvents => 8,
+    match AttachMethod::of_this_kernel() {
+        AttachMethod::Links => 64,
+        AttachMethod::PerfEvents => 8,
     }
 }
 

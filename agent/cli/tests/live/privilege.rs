@@ -27,7 +27,7 @@ use seccompiler::{BpfProgram, SeccompAction, SeccompFilter};
 
 const SAMPLES: u64 = 400;
 /// The empty capability set and `CAP_BPF` alone, as /proc shows them.
-const NOTHING: &str = "0000000000000000";
+const NO_CAPABILITIES: &str = "0000000000000000";
 const BPF_ALONE: &str = "0000008000000000";
 /// `CAP_NET_ADMIN` alone, and with `CAP_BPF`.
 const NET_ADMIN_ALONE: &str = "0000000000001000";
@@ -164,8 +164,8 @@ fn an_agent_started_by_root_changes_its_user_and_writes_no_file_of_root() -> Res
     for line in [
         format!("Uid:\t{USER}\t{USER}\t{USER}\t{USER}"),
         format!("Gid:\t{USER}\t{USER}\t{USER}\t{USER}"),
-        format!("CapPrm:\t{NOTHING}"),
-        format!("CapBnd:\t{NOTHING}"),
+        format!("CapPrm:\t{NO_CAPABILITIES}"),
+        format!("CapBnd:\t{NO_CAPABILITIES}"),
         "Seccomp:\t2".to_owned(),
     ] {
         ensure!(main.lines().any(|other| other == line), "{line} in\n{main}");
@@ -379,10 +379,10 @@ fn confined(process: u32, user: u32) -> Result<BTreeSet<String>> {
             let may_keep = matches!(set, "CapPrm" | "CapEff");
             let kept: &[&str] = match name {
                 // Before Linux 5.19, changing maps needs this capability.
-                "capture" if may_keep => &[NOTHING, BPF_ALONE],
+                "capture" if may_keep => &[NO_CAPABILITIES, BPF_ALONE],
                 // The thread attaches to a control group that is created again.
                 "cgroup" if may_keep => &[NET_ADMIN_ALONE, NET_ADMIN_AND_BPF],
-                _ => &[NOTHING],
+                _ => &[NO_CAPABILITIES],
             };
             ensure!(kept.contains(&left), "{status}");
         }

@@ -28,7 +28,7 @@ use tempfile::TempDir;
 const SIZES: [usize; 2] = [644_000, 2_720_000];
 const PATIENCE: Duration = Duration::from_secs(60);
 /// Time after which no more of a publisher's samples arrive, even if the agent lost some of them.
-const QUIET: Duration = Duration::from_secs(6);
+const LAST_SAMPLE_TIMEOUT: Duration = Duration::from_secs(6);
 /// Type as the peers announce it, in the style of ROS.
 const CLOUD: &str = "sensor_msgs/msg/PointCloud2";
 /// Offset of the points, after encapsulation, header, fields and sizes.
@@ -136,7 +136,7 @@ fn check_payloads(
         let mut missed = 0;
         let mut last_item = Instant::now();
         while received.len() as u64 + missed < stream.count {
-            let next = match next_within(&mut lines, QUIET) {
+            let next = match next_within(&mut lines, LAST_SAMPLE_TIMEOUT) {
                 // The agent may have seen neither the last samples nor a HEARTBEAT after them.
                 Ok(Some(StreamItem::Nothing)) | Err(_)
                     if !lossless_metering
@@ -392,7 +392,7 @@ fn stopped_and_killed_readers_delay_no_other_reader() -> Result<()> {
         }
         match next(&mut lines)?.context("the stream ended")? {
             StreamItem::Sample(sample, _) => {
-                ensure!(sample.sequence_number == number, "{sample:?}")
+                ensure!(sample.sequence_number == number, "{sample:?}");
             }
             StreamItem::Missed(missed) => bail!("{number}: {missed:?}"),
             StreamItem::Nothing => bail!("{number}: no sample"),

@@ -25,7 +25,7 @@ const TIME_WAIT: Duration = Duration::from_secs(75);
 const NODES: f64 = 6.0;
 const LISTENING: [(&str, &str); 1] = [("state", "listening")];
 /// Every command that needs no participant, in each of its forms.
-const FREE: &[&str] = &[
+const DAEMON_COMMANDS: &[&str] = &[
     "topic list",
     "topic list -t",
     "topic list -v",
@@ -60,8 +60,8 @@ const FREE: &[&str] = &[
     "component list",
 ];
 
-/// Some of [`FREE`], one for each kind of facts.
-const FREE_OF_ZENOH: &[&str] = &[
+/// Some of [`DAEMON_COMMANDS`], one for each kind of facts.
+const ZENOH_DAEMON_COMMANDS: &[&str] = &[
     "topic list -v --include-hidden-topics",
     "topic info -v /chatter",
     "topic info -v /fibonacci/_action/status",
@@ -238,8 +238,8 @@ impl Robot<'_> {
     /// Returns the compared commands.
     fn free(&self) -> &'static [&'static str] {
         match self.host.middleware {
-            Middleware::Zenoh => FREE_OF_ZENOH,
-            _ => FREE,
+            Middleware::Zenoh => ZENOH_DAEMON_COMMANDS,
+            _ => DAEMON_COMMANDS,
         }
     }
 

@@ -6,8 +6,7 @@
 //!
 //! - A reply follows its request. A request that left at `d` and a reply stamped `s` show that the
 //!   peer is ahead by at most `s - d`. This holds whatever the network does.
-//! - An ACKNACK has no stamp, but it follows the message that it acknowledges, and the HEARTBEAT
-//! that
+//! - An ACKNACK has no stamp, but it follows the message that it acknowledges, and the HEARTBEAT that
 //!   requested it. The time from the later one is a round trip. The peer is ahead by at most the
 //!   lower bound and the fastest round trip. This assumes that the fastest of many messages took no
 //!   longer than that.

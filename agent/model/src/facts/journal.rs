@@ -78,7 +78,7 @@ impl Journal {
     }
 
     /// Records samples that subscriptions will not receive, until the next [`Self::take_missing`].
-    pub fn leave_missing(&mut self, missing: Missing) {
+    pub fn add_missing(&mut self, missing: Missing) {
         if let Some(last) = self.missing.last_mut()
             && (last.writer, last.reason) == (missing.writer, missing.reason)
             && missing.reason != MissedReason::Incomplete
@@ -112,7 +112,7 @@ impl Journal {
     }
 
     /// Adds a receiver's loss, extending one of the latest entries if the loss continues it.
-    pub fn lose_delivery(&mut self, loss: DeliveryLoss) {
+    pub fn add_delivery_loss(&mut self, loss: DeliveryLoss) {
         let key_of = |loss: &DeliveryLoss| {
             let DeliveryLoss {
                 writer,

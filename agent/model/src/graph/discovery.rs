@@ -218,7 +218,7 @@ impl Discovery {
                 participant.seen(at);
                 Some(participant.priority())
             }
-            None if evidence == Priority::NOTHING => None,
+            None if evidence == Priority::NO_EVIDENCE => None,
             None => self.pending_participants.priority(&prefix),
         };
         priority.is_some_and(|priority| priority.or(evidence) != priority)

@@ -421,7 +421,7 @@ impl Delivery {
     #[must_use]
     pub fn count_common(&self, other: &Self) -> u64 {
         let sequence = self.reception.sequence();
-        sequence.common_with(other.reception.sequence())
+        sequence.count_common(other.reception.sequence())
     }
 
     /// Counts this many messages as duplicates, because another delivery of the same receiver

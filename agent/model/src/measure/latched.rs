@@ -73,12 +73,12 @@ struct LatchedWriter {
     allowance: WriterAllowance,
     /// Number and source timestamp of the last message.
     newest: Option<(SequenceNumber, Option<Timestamp>)>,
-    last: Last,
+    last: LastMessage,
 }
 
 /// The last message of a writer.
 #[derive(Debug)]
-enum Last {
+enum LastMessage {
     /// No complete message was seen.
     Unseen,
     /// The message, and the time of its arrival.
@@ -107,24 +107,24 @@ impl Latched {
             topic: about.clone(),
             allowance: WriterAllowance::new(WRITER_ALLOWANCE),
             newest: None,
-            last: Last::Unseen,
+            last: LastMessage::Unseen,
         };
         let Some(known) = self.writers.get_or_insert_with(writer, new) else {
             return;
         };
         known.topic = about;
         // A message that was kept for a watch may be too large without the watch.
-        if let Last::Kept(sample, _) = &known.last
+        if let LastMessage::Kept(sample, _) = &known.last
             && size(sample) > known.most()
         {
-            let last = Last::TooLarge(saturated_size(size(sample)));
+            let last = LastMessage::TooLarge(saturated_size(size(sample)));
             self.replace(writer, last);
         }
     }
 
     /// Drops a writer and its message.
     pub fn forget(&mut self, writer: Guid) {
-        self.replace(writer, Last::Unseen);
+        self.replace(writer, LastMessage::Unseen);
         if let Some(known) = self.writers.remove(&writer) {
             self.allowance.forget(&known.allowance);
             self.assembly.release(writer);
@@ -185,7 +185,7 @@ impl Latched {
             known.newest = Some((number, source));
             self.assembly.release(writer);
             // The kept message is no longer the last.
-            self.replace(writer, Last::Unseen);
+            self.replace(writer, LastMessage::Unseen);
         }
         self.assembly.put(sample, payload, 0);
         if !self.assembly.is_whole(writer, number) {
@@ -224,7 +224,7 @@ impl Latched {
         known.newest = Some(about);
         self.assembly.release(sample.writer);
         if size(sample) > known.most() {
-            let last = Last::TooLarge(saturated_size(size(sample)));
+            let last = LastMessage::TooLarge(saturated_size(size(sample)));
             self.replace(sample.writer, last);
         } else {
             self.keep(Arc::clone(sample), at);
@@ -249,8 +249,8 @@ impl Latched {
         known.newest = Some(about);
         let bytes = usize::try_from(sample.size()).unwrap_or(usize::MAX);
         let last = match bytes > known.most() {
-            true => Last::TooLarge(sample.size()),
-            false => Last::Paused,
+            true => LastMessage::TooLarge(sample.size()),
+            false => LastMessage::Paused,
         };
         self.replace(writer, last);
     }
@@ -268,7 +268,7 @@ impl Latched {
     #[must_use]
     pub fn samples(&self) -> Vec<(ModelTime, Arc<Sample>)> {
         let kept = self.writers.values().filter_map(|known| match &known.last {
-            Last::Kept(sample, at) => Some((*at, Arc::clone(sample))),
+            LastMessage::Kept(sample, at) => Some((*at, Arc::clone(sample))),
             _ => None,
         });
         let mut kept: Vec<_> = kept.collect();
@@ -281,11 +281,11 @@ impl Latched {
     pub fn facts(&self, writer: Guid) -> Option<LatchedFacts> {
         let known = self.writers.get(&writer)?;
         Some(match &known.last {
-            Last::Unseen => LatchedFacts::Unseen,
-            Last::Kept(sample, _) => LatchedFacts::Kept(saturated_size(size(sample))),
-            Last::TooLarge(bytes) => LatchedFacts::TooLarge(*bytes),
-            Last::Paused => LatchedFacts::Paused,
-            Last::NoRoom(bytes) => LatchedFacts::NoRoom(*bytes),
+            LastMessage::Unseen => LatchedFacts::Unseen,
+            LastMessage::Kept(sample, _) => LatchedFacts::Kept(saturated_size(size(sample))),
+            LastMessage::TooLarge(bytes) => LatchedFacts::TooLarge(*bytes),
+            LastMessage::Paused => LatchedFacts::Paused,
+            LastMessage::NoRoom(bytes) => LatchedFacts::NoRoom(*bytes),
         })
     }
 
@@ -311,18 +311,18 @@ impl Latched {
     /// Keeps a message, if the cap on bytes allows.
     fn keep(&mut self, sample: Arc<Sample>, at: ModelTime) {
         let (writer, bytes) = (sample.writer, size(&sample));
-        self.replace(writer, Last::Unseen);
+        self.replace(writer, LastMessage::Unseen);
         let known = self.writers.get(&writer);
         let is_watched = known.is_some_and(|known| known.topic.is_watched);
         while bytes > self.bytes.room() {
             self.bytes.refuse();
             let Some((other, size)) = self.largest(is_watched, (writer.prefix, bytes)) else {
-                self.replace(writer, Last::NoRoom(saturated_size(bytes)));
+                self.replace(writer, LastMessage::NoRoom(saturated_size(bytes)));
                 return;
             };
-            self.replace(other, Last::NoRoom(saturated_size(size)));
+            self.replace(other, LastMessage::NoRoom(saturated_size(size)));
         }
-        self.replace(writer, Last::Kept(sample, at));
+        self.replace(writer, LastMessage::Kept(sample, at));
     }
 
     /// Returns the writer whose message is dropped for a new one, and the size of that message. It
@@ -336,7 +336,7 @@ impl Latched {
     ) -> Option<(Guid, usize)> {
         let kept = || {
             self.writers.iter().filter_map(|(writer, known)| {
-                let Last::Kept(sample, at) = &known.last else {
+                let LastMessage::Kept(sample, at) = &known.last else {
                     return None;
                 };
                 (is_watched || !known.topic.is_watched).then_some((writer, sample, *at))
@@ -355,14 +355,14 @@ impl Latched {
     }
 
     /// Replaces the state of a writer's last message.
-    fn replace(&mut self, writer: Guid, last: Last) {
+    fn replace(&mut self, writer: Guid, last: LastMessage) {
         let Some(known) = self.writers.get_mut(&writer) else {
             return;
         };
-        if let Last::Kept(sample, _) = &last {
+        if let LastMessage::Kept(sample, _) = &last {
             self.bytes.add(size(sample));
         }
-        if let Last::Kept(sample, _) = std::mem::replace(&mut known.last, last) {
+        if let LastMessage::Kept(sample, _) = std::mem::replace(&mut known.last, last) {
             self.bytes.sub(size(&sample));
         }
     }
@@ -381,7 +381,8 @@ impl LatchedWriter {
     /// captured completely.
     fn is_newer_or_incomplete(&self, about: (SequenceNumber, Option<Timestamp>)) -> bool {
         let is_last = self.newest.is_some_and(|(number, _)| number == about.0);
-        is_last && matches!(self.last, Last::Unseen | Last::Paused) || self.is_newer(about)
+        is_last && matches!(self.last, LastMessage::Unseen | LastMessage::Paused)
+            || self.is_newer(about)
     }
 
     /// Returns whether a message is later than the last one. A lower number is later only if its

@@ -301,7 +301,7 @@ impl Sequence {
 
     /// Returns how many remembered numbers arrived both here and at `other`.
     #[must_use]
-    pub fn common_with(&self, other: &Self) -> u64 {
+    pub fn count_common(&self, other: &Self) -> u64 {
         if !self.started() || !other.started() {
             return 0;
         }

@@ -313,7 +313,7 @@ impl Writer {
             });
         if is_sampled || takes {
             let counted = self.sampled_observation(observation, is_sampled, context);
-            self.leave_unseen(context.journal);
+            self.report_unseen(context.journal);
             if let Some(sampled) = self.sampled.as_mut().filter(|_| is_exact) {
                 // From now on, the uprobe sees every message.
                 sampled.end();
@@ -402,7 +402,7 @@ impl Writer {
     pub fn advance(&mut self, context: &mut MeasurementContext<'_>) {
         if let Some(sampled) = &mut self.sampled {
             sampled.tick(context.now);
-            self.leave_unseen(context.journal);
+            self.report_unseen(context.journal);
         }
         let (now, window) = (context.now, settle_window(self.traits.reliable));
         let (reception, mut settling) =
@@ -417,7 +417,7 @@ impl Writer {
     pub fn settle(&mut self, context: &mut MeasurementContext<'_>) {
         if let Some(sampled) = &mut self.sampled {
             sampled.settle_all();
-            self.leave_unseen(context.journal);
+            self.report_unseen(context.journal);
         }
         let (reception, mut settling) =
             self.parts(context.journal, (context.now, context.has_receivers));
@@ -585,7 +585,7 @@ impl Settling<'_> {
             return;
         };
         self.tally.incomplete += u64::from(incomplete);
-        self.journal.leave_missing(Missing {
+        self.journal.add_missing(Missing {
             writer: self.writer,
             first,
             last,

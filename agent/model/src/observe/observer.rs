@@ -270,7 +270,7 @@ impl Observer {
             Input::Observation(observation) => self.observe(observation),
             Input::ParticipantAlive(prefix, at) => {
                 let at = self.graph.wall_clock.model_time(at);
-                self.graph.discovery.seen(prefix, at, Priority::NOTHING);
+                self.graph.discovery.seen(prefix, at, Priority::NO_EVIDENCE);
             }
             Input::Socket(facts) => self.graph.receivers.socket(facts),
             Input::SocketsRead => self.link_sessions(),
@@ -483,7 +483,7 @@ impl Observer {
         let writer = observation.head().writer;
         if matches!(observation, Observation::Presence(_)) {
             let (sender, at) = (observation.sender(), observation.head().at);
-            self.graph.discovery.seen(sender, at, Priority::NOTHING);
+            self.graph.discovery.seen(sender, at, Priority::NO_EVIDENCE);
             return;
         }
         self.renew_lease(observation);

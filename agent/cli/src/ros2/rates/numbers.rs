@@ -16,7 +16,7 @@ const MAX_UNSEEN: u64 = 10_000;
 /// restarted writer.
 const MAX_LATE_DISTANCE: u64 = 256;
 /// Maximum time by which a message is late.
-const LATE_FOR: i64 = 2 * SECOND;
+const MAX_LATENESS: i64 = 2 * SECOND;
 /// Maximum time from a writer's timestamp to the poll that finds the message.
 const LONGEST_POLL: i64 = 10 * SECOND;
 /// Maximum number of remembered gaps, whose messages may still be seen.
@@ -130,7 +130,7 @@ impl Numbers {
             return Place::Counted;
         }
         let is_late = newest.number - message.number < MAX_LATE_DISTANCE
-            && message.captured.saturating_sub(newest.captured) < LATE_FOR;
+            && message.captured.saturating_sub(newest.captured) < MAX_LATENESS;
         match (is_late, message.is_sampled) {
             // The message is a duplicate, or was sent before the measurement.
             (true, true) => Place::Counted,

@@ -94,7 +94,7 @@ impl Robot<'_, '_> {
     /// Checks that everything is written again: the state with this node, and a recording.
     fn recovers(&self, counted: &mut Counted, node: &str, name: &str) -> Result<()> {
         let written = self.writes("written")?;
-        self.disk.fail(Failing::NOTHING);
+        self.disk.fail(Failing::NO_OPERATION);
         wait_until("a state write", || Ok(self.writes("written")? > written))?;
         let text = fs::read_to_string(self.place.join("state/discovery.json"))?;
         serde_json::from_str::<Value>(&text).context("half a state")?;
@@ -183,7 +183,7 @@ fn an_eio_disk_loses_only_its_files_and_no_message() -> Result<()> {
         status == 200 && ended["report"]["messages"] == 100,
         "{status} {ended}"
     );
-    disk.fail(Failing::NOTHING);
+    disk.fail(Failing::NO_OPERATION);
     readable(&place.join("bags/reads"), 100)?;
     counted.check(&scene.agent)?;
     robot.record("last")?;

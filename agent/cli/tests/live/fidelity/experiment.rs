@@ -30,7 +30,7 @@ const RECORD_RING: u32 = 16 << 20;
 const SETTLED: Duration = Duration::from_secs(60);
 /// Interval of checks for silence. RustDDS sends somewhat later than it logs, and announcements
 /// never cease.
-const QUIET: Duration = Duration::from_millis(400);
+const SILENCE_CHECK_INTERVAL: Duration = Duration::from_millis(400);
 const PAUSE: Duration = Duration::from_millis(20);
 const ANNOUNCEMENTS: u64 = 10;
 /// Maximum number of incomplete datagrams without a report (`docs/limitations.md`).
@@ -466,7 +466,7 @@ impl Peers {
         };
         let mut before = state()?;
         loop {
-            std::thread::sleep(QUIET);
+            std::thread::sleep(SILENCE_CHECK_INTERVAL);
             let now = state()?;
             if now.1 == before.1 && now.0 < before.0 + ANNOUNCEMENTS {
                 return Ok(());

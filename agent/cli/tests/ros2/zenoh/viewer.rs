@@ -46,7 +46,7 @@ fn a_viewer_receives_point_clouds_byte_for_byte() -> Result<()> {
     while hashes.len() < COUNT {
         match viewer.next_within(PATIENCE)?.context("no message")? {
             ServerMessage::Data(data) if data.subscription == id => {
-                hashes.push(hash(&data.payload)?)
+                hashes.push(hash(&data.payload)?);
             }
             ServerMessage::Status(status) => anyhow::bail!("{}", status.message),
             _ => {}

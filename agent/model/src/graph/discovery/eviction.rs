@@ -143,14 +143,14 @@ impl Victims {
         };
         let is_trusted = priority.local || claims * 2 < discovery.cap(table);
         let is_nothing =
-            |victim: &Victim| victim.priority == Priority::NOTHING && !victim.is_established;
+            |victim: &Victim| victim.priority == Priority::NO_EVIDENCE && !victim.is_established;
         let goes =
             |victim: &mut Victim| victim.priority < priority && (is_trusted || is_nothing(victim));
         Some(self.others.pop_if(goes)?.guid)
     }
 
     fn claim(&mut self, priority: Priority) {
-        let is_claim = priority != Priority::NOTHING && !priority.local;
+        let is_claim = priority != Priority::NO_EVIDENCE && !priority.local;
         self.claims += usize::from(is_claim);
         self.watched_claims += usize::from(is_claim && priority.watched);
     }
@@ -241,7 +241,7 @@ fn silence_priority(participant: &Participant, now: ModelTime) -> Option<Priorit
         return None;
     }
     if is_silent_for(MAX_SILENCE) {
-        return Some(Priority::NOTHING);
+        return Some(Priority::NO_EVIDENCE);
     }
     let is_established = last - participant.first_seen >= MIN_ESTABLISHED_SPAN;
     (!is_established && is_silent_for(UNESTABLISHED_SILENCE)).then_some(priority)

@@ -199,7 +199,7 @@ impl Zenoh {
             match (before, direction.owner(stream)) {
                 (None, Some(owner)) => show(ReportFact::Owner(stream.socket, owner.guid_prefix())),
                 (Some(owner), None) => {
-                    show(ReportFact::Disowned(stream.socket, owner.guid_prefix()))
+                    show(ReportFact::Disowned(stream.socket, owner.guid_prefix()));
                 }
                 _ => {}
             }

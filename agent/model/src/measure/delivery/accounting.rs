@@ -158,7 +158,7 @@ impl Accounting<'_> {
             last,
         };
         let Some(withheld) = &mut self.withheld else {
-            self.journal.lose_delivery(loss);
+            self.journal.add_delivery_loss(loss);
             return;
         };
         withheld.push_back(loss);

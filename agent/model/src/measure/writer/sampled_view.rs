@@ -17,10 +17,10 @@ use crate::measure::samples::Budget;
 
 impl Writer {
     /// Reports samples to the journal that were sent but not seen.
-    pub(super) fn leave_unseen(&mut self, journal: &mut Journal) {
+    pub(super) fn report_unseen(&mut self, journal: &mut Journal) {
         let unseen = self.sampled.as_mut().map(|sampled| sampled.take_unseen());
         for (first, last) in unseen.into_iter().flatten() {
-            journal.leave_missing(Missing {
+            journal.add_missing(Missing {
                 writer: self.guid,
                 first,
                 last,

@@ -172,7 +172,7 @@ impl Observer {
             ReadOutcome::Paused => self.apply_lists_to_latched(writer, sample.head.at),
             ReadOutcome::Transition(from, node) => self.note_transition(from, node),
             ReadOutcome::Malformed(standard, error) => {
-                self.decode_error(standard.stage(), error.reason)
+                self.decode_error(standard.stage(), error.reason);
             }
         }
     }

@@ -51,13 +51,13 @@ impl Observer {
             ReportFact::Sample(sample) => self.zenoh_sample(report.stream, at, sample),
             ReportFact::Owner(socket, prefix) => self.graph.receivers.add_owner(socket, prefix),
             ReportFact::Disowned(socket, prefix) => {
-                self.graph.receivers.remove_owner(socket, prefix)
+                self.graph.receivers.remove_owner(socket, prefix);
             }
             ReportFact::Alive(session) => alive = Some(session),
             ReportFact::Relayed(session) => {
                 self.graph
                     .discovery
-                    .seen(session.guid_prefix(), at, Priority::NOTHING);
+                    .seen(session.guid_prefix(), at, Priority::NO_EVIDENCE);
             }
             ReportFact::Missed(destination) => {
                 self.measure.profiler.missed(destination, at);
@@ -68,7 +68,7 @@ impl Observer {
             let prefix = session.guid_prefix();
             match self.graph.discovery.knows(prefix) {
                 true => {
-                    self.graph.discovery.seen(prefix, at, Priority::NOTHING);
+                    self.graph.discovery.seen(prefix, at, Priority::NO_EVIDENCE);
                 }
                 false => zenoh.graph.announce_again(session, at),
             }

@@ -41,7 +41,7 @@ const MIN_JUMP_RADIANS: f64 = 0.5;
 /// One edge.
 #[derive(Debug, Default)]
 pub(super) struct Edge {
-    last: Option<Last>,
+    last: Option<LastTransform>,
     broadcasters: Bounded<EdgeBroadcasters, Vec<Source>>,
     /// Transforms so far.
     count: u64,
@@ -60,7 +60,7 @@ pub(super) struct Edge {
 
 /// The last transform.
 #[derive(Clone, Debug)]
-struct Last {
+struct LastTransform {
     parent: Arc<str>,
     stamp: (i32, u32),
     pose: Pose,
@@ -187,7 +187,7 @@ impl Edge {
             Some(TransformJump::Time) => self.jumps.time += 1,
             None => {}
         }
-        self.last = Some(Last {
+        self.last = Some(LastTransform {
             parent,
             stamp: transform.stamp,
             pose: transform.pose,
@@ -282,7 +282,7 @@ impl Edge {
     }
 
     /// Returns whether two broadcasters are at work.
-    fn has_several(&self, last: &Last, now: ModelTime) -> bool {
+    fn has_several(&self, last: &LastTransform, now: ModelTime) -> bool {
         let at_work = self
             .broadcasters
             .iter()
@@ -297,7 +297,7 @@ impl Edge {
     }
 
     pub(super) fn facts(&self, child: &Arc<str>, now: ModelTime) -> EdgeFacts {
-        let last = self.last.clone().unwrap_or(Last {
+        let last = self.last.clone().unwrap_or(LastTransform {
             parent: Arc::default(),
             stamp: (0, 0),
             pose: Pose {
