@@ -20,7 +20,7 @@ use std::time::Duration;
 
 use libc::{c_int, socklen_t};
 
-use turns::Turns;
+use turns::BlockReader;
 
 use super::container::add;
 
@@ -117,7 +117,7 @@ pub enum RingError {
 #[derive(Debug)]
 pub struct Ring {
     // Fields are dropped in this order: the memory is released before the socket is closed.
-    turns: Turns,
+    turns: BlockReader,
     _memory: Mapping,
     socket: OwnedFd,
     statistics: Statistics,
@@ -176,7 +176,7 @@ impl Ring {
         // SAFETY: the mapping holds `settings.blocks` blocks of whole pages, and starts at a page.
         // `turns` is dropped before the mapping. The other side is the kernel, which follows the
         // TPACKET_V3 protocol.
-        let turns = unsafe { Turns::new(memory.start.cast(), block_size, settings.blocks) };
+        let turns = unsafe { BlockReader::new(memory.start.cast(), block_size, settings.blocks) };
         let ring = Self {
             turns,
             _memory: memory,

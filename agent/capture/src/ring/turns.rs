@@ -10,7 +10,7 @@ use super::block::{Frames, STATUS_OFFSET};
 
 /// The blocks, and the index of the next one.
 #[derive(Debug)]
-pub(super) struct Turns {
+pub(super) struct BlockReader {
     start: NonNull<u8>,
     block_size: usize,
     blocks: usize,
@@ -22,14 +22,14 @@ pub(super) struct Turns {
 /// blocks wait for the reader, so a block should not be held for long.
 #[derive(Debug)]
 pub struct Block<'a> {
-    turns: &'a mut Turns,
+    turns: &'a mut BlockReader,
 }
 
 // SAFETY: the caller of `new` guarantees that the memory outlives this value. It is accessed only
 // through this value and belongs to no thread.
-unsafe impl Send for Turns {}
+unsafe impl Send for BlockReader {}
 
-impl Turns {
+impl BlockReader {
     /// Creates a ring over adjacent blocks at `start`.
     ///
     /// # Safety
@@ -137,9 +137,9 @@ mod tests {
             Self(NonNull::new(Box::into_raw(words).cast()).unwrap())
         }
 
-        fn turns(&self) -> Turns {
+        fn turns(&self) -> BlockReader {
             // SAFETY: length and alignment are as required, and every test frees the memory last.
-            unsafe { Turns::new(self.0, BLOCK, BLOCKS) }
+            unsafe { BlockReader::new(self.0, BLOCK, BLOCKS) }
         }
 
         /// Acts as the kernel: waits until the block is free, fills it, and releases it.
@@ -176,7 +176,7 @@ mod tests {
     }
 
     /// Waits for the next block and returns its frames.
-    fn next(turns: &mut Turns) -> Vec<Vec<u8>> {
+    fn next(turns: &mut BlockReader) -> Vec<Vec<u8>> {
         loop {
             if let Some(block) = turns.block() {
                 return block.frames().map(|frame| frame.bytes.to_vec()).collect();

@@ -120,7 +120,7 @@ impl Waiting {
             Item::Message { bytes, .. } => bytes.len(),
             Item::Record(_) | Item::Uncertain(_) => 0,
         };
-        if length > self.bytes.room() {
+        if length > self.bytes.remaining() {
             self.items.refuse();
         } else if self.items.push(item).is_none() {
             self.bytes.add(length);

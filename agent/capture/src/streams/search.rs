@@ -33,7 +33,7 @@ pub struct Search {
 
 impl Search {
     /// Returns the capacity for collected bytes, in bytes.
-    pub fn held(&self) -> usize {
+    pub fn held_bytes(&self) -> usize {
         self.held.capacity()
     }
 

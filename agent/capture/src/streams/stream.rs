@@ -152,7 +152,7 @@ impl Stream {
     /// Returns the number of held bytes.
     pub fn held(&self) -> usize {
         let partial = match &self.position {
-            Position::Searching(search) | Position::Beginning(search) => search.held(),
+            Position::Searching(search) | Position::Beginning(search) => search.held_bytes(),
             Position::Batch(partial) => partial.captured.capacity(),
             Position::Other => 0,
         };

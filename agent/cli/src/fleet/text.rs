@@ -102,7 +102,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_fleet_is_a_table_and_the_details_of_robots_in_trouble() {
+    fn a_fleet_is_printed_as_a_table_with_details_of_faulty_robots() {
         let robot = |name: &str, state, age_s| Robot {
             name: name.to_owned(),
             state,

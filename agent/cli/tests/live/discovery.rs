@@ -69,7 +69,7 @@ fn late_agent_ratio(stack: Stack) -> Result<()> {
         rate: 100.0,
         ..Stream::small(1500)
     };
-    let (mut publisher, _subscriber) = talking(&link, stack, &stream)?;
+    let (mut publisher, _subscriber) = start_talker_pair(&link, stack, &stream)?;
     std::thread::sleep(Duration::from_secs(1));
     let watcher = Watcher::start(&link.monitor)?;
     let unknown = |page: &Scrape| page.sum("ros2_unknown_writers", &[]) == 1.0;
@@ -105,7 +105,7 @@ fn one_topic_name_in_two_domains_counts_as_two_topics() -> Result<()> {
             domain,
             ..Stream::small(count)
         };
-        pairs.push(talking(&link, stack, &stream)?);
+        pairs.push(start_talker_pair(&link, stack, &stream)?);
     }
     let nodes = |page: &Scrape| {
         let of = |domain| page.sum("ros2_nodes", &[("domain_id", domain)]) == 2.0;
@@ -390,7 +390,7 @@ impl<'a> Watcher<'a> {
 }
 
 /// A publisher on the robot that sends to a subscriber on the monitor.
-fn talking(link: &Link, stack: Stack, stream: &Stream) -> Result<(Peer, Peer)> {
+fn start_talker_pair(link: &Link, stack: Stack, stream: &Stream) -> Result<(Peer, Peer)> {
     let mut subscriber = Peer::start(
         &link.monitor,
         stack,

@@ -311,7 +311,7 @@ fn an_unreceived_message_is_late_in_its_socket() -> Result<()> {
 }
 
 #[test]
-fn a_call_that_sleeps_is_late_with_its_cause_from_the_first_question_on() -> Result<()> {
+fn a_sleeping_call_is_late_with_its_cause_from_the_first_request_on() -> Result<()> {
     let host = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let program = TracedProgram::build(248, &[])?;

@@ -247,7 +247,7 @@ fn samples_that_the_sender_drops_are_lost_at_the_sender() -> Result<()> {
 }
 
 #[test]
-fn segments_that_a_link_sends_again_are_those_of_the_kernel_and_a_finding() -> Result<()> {
+fn retransmitted_segments_of_a_link_equal_those_of_the_kernel_and_are_a_finding() -> Result<()> {
     let link = Link::new()?;
     let [small, ..] = streams(link.robot.address());
     let stream = Stream {

@@ -50,28 +50,28 @@ fn fast_dds_with_shared_memory_is_recorded_or_counted_to_the_message() -> Result
 // Coverage: shared memory, with a uprobe | rmw_fastrtps | installed | exact
 #[test]
 #[ignore = "needs ROS 2 with rmw_fastrtps_cpp: make test-ros2"]
-fn fast_dds_with_shared_memory_and_the_uprobe_is_recorded_to_the_message() -> Result<()> {
+fn every_message_of_fast_dds_with_shared_memory_and_the_uprobe_is_recorded() -> Result<()> {
     check_bag(Middleware::FastExact("auto"))
 }
 
 // Coverage: UDP | rmw_fastrtps | installed | exact
 #[test]
 #[ignore = "needs ROS 2 with rmw_fastrtps_cpp: make test-ros2"]
-fn fast_dds_over_udp_is_recorded_to_the_message() -> Result<()> {
+fn every_message_of_fast_dds_over_udp_is_recorded() -> Result<()> {
     check_bag(Middleware::FastUdp)
 }
 
 // Coverage: UDP | rmw_cyclonedds | installed | exact
 #[test]
 #[ignore = "needs ROS 2 with rmw_cyclonedds_cpp: make test-ros2"]
-fn cyclone_dds_is_recorded_to_the_message() -> Result<()> {
+fn every_message_of_cyclone_dds_is_recorded() -> Result<()> {
     check_bag(Middleware::Cyclone)
 }
 
 // Coverage: Zenoh over TCP | rmw_zenoh | installed | exact
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
-fn zenoh_is_recorded_to_the_message() -> Result<()> {
+fn every_message_of_zenoh_is_recorded() -> Result<()> {
     check_bag(Middleware::Zenoh)
 }
 

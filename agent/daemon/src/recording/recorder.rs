@@ -491,11 +491,11 @@ impl<'a> Recorder<'a> {
             TopicDecision::Excluded | TopicDecision::NoRoom => name.len(),
         };
         let is_half_full = self.topics.len() >= RecordedTopics::CAP / 2
-            || self.names.room() < RecordedNames::CAP / 2;
+            || self.names.remaining() < RecordedNames::CAP / 2;
         if is_half_full && matches!(place, TopicDecision::Excluded) {
             return;
         }
-        if bytes > self.names.room() {
+        if bytes > self.names.remaining() {
             self.names.refuse();
         } else if self.topics.insert(name.to_owned(), place).is_none() {
             self.names.add(bytes);
@@ -543,7 +543,7 @@ impl<'a> Recorder<'a> {
             self.topics.refuse();
             return Ok(TopicDecision::NoRoom);
         }
-        if name.len() + message_type.len() > self.names.room() {
+        if name.len() + message_type.len() > self.names.remaining() {
             self.names.refuse();
             return Ok(TopicDecision::NoRoom);
         }
@@ -554,7 +554,7 @@ impl<'a> Recorder<'a> {
             Some(offered) => offered.equivalence_hash.map(|hash| hash.to_string()),
             None => announced.publishers.first()?.equivalence_hash.clone(),
         });
-        let publishers = announced.publishers.iter().take(self.writers.room());
+        let publishers = announced.publishers.iter().take(self.writers.remaining());
         let mut offered: Vec<_> = publishers
             .map(|publisher| (publisher.guid.clone(), qos(&publisher.qos)))
             .collect();

@@ -535,7 +535,7 @@ mod tests {
     }
 
     #[test]
-    fn real_numbers_stay_real_and_an_unknown_lag_stays_infinite() {
+    fn floats_stay_floats_and_an_unknown_lag_stays_infinite() {
         let mut points = empty();
         points.begin(1);
         points.open(metric("process_cpu_seconds_total"));

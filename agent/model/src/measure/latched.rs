@@ -314,7 +314,7 @@ impl Latched {
         self.replace(writer, LastMessage::Unseen);
         let known = self.writers.get(&writer);
         let is_watched = known.is_some_and(|known| known.topic.is_watched);
-        while bytes > self.bytes.room() {
+        while bytes > self.bytes.remaining() {
             self.bytes.refuse();
             let Some((other, size)) = self.largest(is_watched, (writer.prefix, bytes)) else {
                 self.replace(writer, LastMessage::NoRoom(saturated_size(bytes)));

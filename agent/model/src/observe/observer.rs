@@ -285,7 +285,7 @@ impl Observer {
             Input::ExpectedChains(chains) => self.derive.chains.expect(chains),
             Input::SharedMemoryUsed(memory) => self.derive.robot.use_shared_memory(&memory),
             Input::RobotExpectations(expected) => self.derive.robot.expect(expected),
-            Input::CausalPublication(publication) => self.chain_published(publication),
+            Input::CausalPublication(publication) => self.add_causal_publication(publication),
             Input::Restored { memory, now } => {
                 self.restore(memory, self.graph.wall_clock.model_time(now));
             }

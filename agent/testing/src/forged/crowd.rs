@@ -23,7 +23,7 @@ const LATE: f64 = 0.8;
 /// Time within which an observer notices the end of a lease.
 const GREY: Duration = Duration::from_millis(2500);
 /// Numbers of permanent participants, and of measured topics of each.
-const STAYING: usize = 20;
+const PERMANENT_MEMBERS: usize = 20;
 const MEASURED: usize = 10;
 const ENTITIES_WRITER: [u8; 4] = [0, 0, 1, 3];
 const ENTITIES_READER: [u8; 4] = [0, 0, 1, 4];
@@ -91,7 +91,7 @@ impl<C: Carrier> Crowd<C> {
             members: Vec::new(),
             silent: Vec::new(),
             tally: Tally::new(),
-            messages: vec![0; STAYING * MEASURED],
+            messages: vec![0; PERMANENT_MEMBERS * MEASURED],
             disposals: Vec::new(),
             participants_created: 0,
             due: now,
@@ -103,7 +103,7 @@ impl<C: Carrier> Crowd<C> {
 
     /// Sets the target number of participants.
     pub fn aim(&mut self, participants: usize) {
-        self.target = participants.clamp(STAYING, self.scale.participants);
+        self.target = participants.clamp(PERMANENT_MEMBERS, self.scale.participants);
     }
 
     /// Changes the graph for this long.
@@ -195,7 +195,7 @@ impl<C: Carrier> Crowd<C> {
         self.drop_expired();
         self.renew()?;
         if changes {
-            let deaths = self.members.len().saturating_sub(STAYING) as f64;
+            let deaths = self.members.len().saturating_sub(PERMANENT_MEMBERS) as f64;
             let rates = [
                 deaths / self.scale.life.as_secs_f64(),
                 self.scale.endpoint_changes,
@@ -263,7 +263,7 @@ impl<C: Carrier> Crowd<C> {
     }
 
     fn birth(&mut self, node: String) -> Result<()> {
-        let staying = self.participants_created < STAYING as u32;
+        let staying = self.participants_created < PERMANENT_MEMBERS as u32;
         let slot = self.free_slot();
         let lease = if staying { 100 } else { self.lease() };
         let mut prefix = *b"\x01\x0fcrowd.....";

@@ -16,7 +16,7 @@ use crate::crates;
 
 #[test]
 #[ignore = "looks at a release: make release"]
-fn cargo_installs_rp_from_the_published_crates_and_leaves_nothing() -> Result<()> {
+fn cargo_installs_rp_from_the_published_crates_and_uninstalls_it_completely() -> Result<()> {
     let directory = tempfile::tempdir()?;
     let registry = directory.path().join("registry");
     // The libraries of others are copies of what the registry has.

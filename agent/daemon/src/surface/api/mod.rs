@@ -88,7 +88,7 @@ pub use pipe::serve as serve_in_process;
 use problem::{Code, Problem};
 use reload::Reloader;
 use ros2probe_message::Library;
-use security::{AccessRules, Needs};
+use security::{AccessRules, RequiredRights};
 pub use server::{OpenError, Server};
 
 /// Maximum time that a request waits for a fresh snapshot, which shows the effects of earlier
@@ -186,7 +186,7 @@ fn nouns(context: Option<&Context>) -> OpenApiRouter<Context> {
         None => views,
     };
     let needs = |read, change, routes: OpenApiRouter<Context>| {
-        let needs = Needs { read, change };
+        let needs = RequiredRights { read, change };
         routes.layer(middleware::from_fn_with_state(
             needs,
             security::require_rights,

@@ -83,7 +83,7 @@ pub(in crate::surface) struct Rights {
 
 /// The rights that the routes of a noun need, for reading and for changes.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Needs {
+pub(super) struct RequiredRights {
     pub(super) read: Access,
     pub(super) change: Access,
 }
@@ -398,7 +398,7 @@ fn refusal(problem: Problem) -> Response {
 
 /// Refuses requests that need more rights than the listener grants.
 pub(super) async fn require_rights(
-    State(needs): State<Needs>,
+    State(needs): State<RequiredRights>,
     Extension(granted): Extension<Rights>,
     request: Request,
     next: Next,

@@ -143,7 +143,7 @@ impl Diagnostics {
                 truncated_text(value, MAX_TEXT),
             );
             bytes += key.len() + value.len();
-            if bytes > self.value_bytes.room() {
+            if bytes > self.value_bytes.remaining() {
                 self.value_bytes.refuse();
                 return Vec::new();
             }

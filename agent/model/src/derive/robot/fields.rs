@@ -65,7 +65,7 @@ impl Fields {
     /// Keeps a message instead of the last one of its writer, if there is room.
     pub(super) fn add(&mut self, origin: &Origin<'_>, payload: &[u8]) {
         self.forget(origin.writer);
-        if payload.len() > self.bytes.room() {
+        if payload.len() > self.bytes.remaining() {
             self.bytes.refuse();
             return;
         }

@@ -126,7 +126,7 @@ impl Zenoh {
         wants_bytes: bool,
         show: &mut impl FnMut(ReportFact<'_>),
     ) {
-        if self.chain_bytes.room() < MIN_FREE_BYTES {
+        if self.chain_bytes.remaining() < MIN_FREE_BYTES {
             self.drop_stale_chains(place.time);
         }
         let is_wanted = |beginning: &[u8]| match NetworkMessage::beginning(beginning) {
@@ -142,7 +142,7 @@ impl Zenoh {
             return;
         };
         let before = direction.held();
-        let room = self.chain_bytes.room();
+        let room = self.chain_bytes.remaining();
         let waited = direction.chains.len();
         let chain = direction.fragment(fragment, place.time, is_wanted, room);
         let was_broken = chain.is_none() && direction.chains.len() < waited;

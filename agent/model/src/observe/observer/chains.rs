@@ -32,7 +32,7 @@ impl Observer {
     }
 
     /// Adds a publication within a callback to the chains.
-    pub(super) fn chain_published(&mut self, publication: &CausalPublication) {
+    pub(super) fn add_causal_publication(&mut self, publication: &CausalPublication) {
         let Derive {
             chains,
             tracer,
