@@ -109,7 +109,7 @@ page-bench: ## first paint with 500 topics, layout, frames and memory of the pag
 	@.ci/prerequisites.sh page
 	cargo build --release --package ros2probe --bin rp
 	MEASURE_MINUTES=$(or $(MEASURE_MINUTES),10) cargo test --release --package ros2probe \
-	    --test live -- --ignored --exact browser::measurements --nocapture
+	    --test live -- --ignored --exact browser::paint_layout_and_memory_of_the_page_are_measured --nocapture
 
 screenshots: ## the pictures of README and docs, from the demo, in target/screenshots (needs root)
 	@.ci/prerequisites.sh demo pictures

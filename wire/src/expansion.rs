@@ -16,14 +16,14 @@ pub enum Expansion {
 
 impl Expansion {
     /// Expanded size that any file may have, in bytes.
-    pub const FREE: u64 = 64 << 20;
+    pub const FREE_BYTES: u64 = 64 << 20;
 
-    /// Returns the maximum expanded size of `compressed` bytes, in bytes: [`Self::FREE`] plus
+    /// Returns the maximum expanded size of `compressed` bytes, in bytes: [`Self::FREE_BYTES`] plus
     /// `factor` times `compressed`, or [`u64::MAX`] without a limit.
     #[must_use]
     pub const fn limit(self, compressed: u64, factor: u64) -> u64 {
         match self {
-            Self::Limited => Self::FREE.saturating_add(compressed.saturating_mul(factor)),
+            Self::Limited => Self::FREE_BYTES.saturating_add(compressed.saturating_mul(factor)),
             Self::Unlimited => u64::MAX,
         }
     }

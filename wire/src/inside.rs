@@ -401,7 +401,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_duration_lies_between_the_start_of_its_bucket_and_that_of_the_next() {
+    fn a_duration_is_within_its_bucket() {
         let mut nanoseconds = 1;
         while nanoseconds < 1 << 34 {
             let index = bucket(nanoseconds);

@@ -135,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn a_control_message_of_another_length_or_kind_is_no_frame() {
+    fn a_control_message_of_another_length_or_kind_is_not_a_frame() {
         for (at, value) in [(4, 0x45), (14, 0xd7), (14, 0xe5), (15, 0x0c)] {
             let mut bytes = BIND;
             bytes[at] = value;

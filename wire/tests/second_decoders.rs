@@ -107,7 +107,7 @@ fn octets(message: &[u8], submessage: &Submessage<'_>) -> u16 {
 }
 
 /// Returns the lines of all messages in a capture.
-fn ours(capture: &Path, line: impl Fn(&[u8], &[Submessage<'_>]) -> String) -> Vec<String> {
+fn decoded_lines(capture: &Path, line: impl Fn(&[u8], &[Submessage<'_>]) -> String) -> Vec<String> {
     let mut lines = Vec::new();
     datagrams(&read(capture), |bytes| {
         if let Ok(message) = Message::parse(bytes) {
@@ -206,7 +206,7 @@ fn scapy_decodes_the_same_submessages() {
         let file = unpacked(&capture);
         let text = output(Command::new(&python).arg(&script).arg(file.path()));
         let theirs: Vec<String> = text.lines().map(str::to_owned).collect();
-        assert_equal(&capture, &ours(&capture, as_scapy), &theirs);
+        assert_equal(&capture, &decoded_lines(&capture, as_scapy), &theirs);
     }
 }
 
@@ -351,7 +351,7 @@ fn tshark_decodes_the_same_submessages_and_payloads() {
             format!("{cells}\t{}", digest(payload.as_bytes()))
         });
         let theirs: Vec<_> = theirs.collect();
-        assert_equal(&capture, &ours(&capture, as_tshark), &theirs);
+        assert_equal(&capture, &decoded_lines(&capture, as_tshark), &theirs);
     }
 }
 

@@ -9,11 +9,11 @@ use std::os::fd::{AsRawFd as _, BorrowedFd, OwnedFd};
 use crate::functions::{Calls, symbol};
 use crate::kernel;
 use crate::library::{self, LibraryError};
-use crate::request::Means;
+use crate::request::AttachMethod;
 
 /// File with the kernel's type of perf events for uprobes. Older interfaces leave probes behind
 /// when a process is killed.
-const KIND: &str = "/sys/bus/event_source/devices/uprobe/type";
+const UPROBE_TYPE_PATH: &str = "/sys/bus/event_source/devices/uprobe/type";
 
 /// Why programs are not attached.
 #[derive(Debug, thiserror::Error)]
@@ -58,7 +58,7 @@ pub struct Attached {
 pub fn attach(
     file: &File,
     calls: Calls,
-    means: Means,
+    means: AttachMethod,
     programs: &[BorrowedFd<'_>],
 ) -> Result<Attached, AttachError> {
     let (expected, given) = (calls.expected(means), programs.len());
@@ -73,14 +73,14 @@ pub fn attach(
     let path = CString::new(path).map_err(|error| AttachError::Kernel(error.into()))?;
     let program = |index: usize| programs.get(index).copied();
     let descriptors = match means {
-        Means::Links if expected == 1 => {
+        AttachMethod::Links if expected == 1 => {
             let offsets: Vec<_> = found.values().map(|place| place.offset).collect();
             let cookies: Vec<_> = found.keys().map(|index| *index as u64).collect();
             let program = program(0).ok_or(AttachError::Programs { expected, given })?;
             let link = kernel::link_functions(program, &path, &offsets, &cookies);
             vec![link.map_err(AttachError::Kernel)?]
         }
-        Means::Links => {
+        AttachMethod::Links => {
             let links = found.iter().filter_map(|(index, place)| {
                 let program = program(*index)?;
                 Some(kernel::link_functions(
@@ -94,8 +94,8 @@ pub fn attach(
                 .collect::<io::Result<_>>()
                 .map_err(AttachError::Kernel)?
         }
-        Means::PerfEvents => {
-            let kind = fs::read_to_string(KIND).map_err(AttachError::NoUprobes)?;
+        AttachMethod::PerfEvents => {
+            let kind = fs::read_to_string(UPROBE_TYPE_PATH).map_err(AttachError::NoUprobes)?;
             let kind = kind.trim().parse().map_err(io::Error::other);
             let kind = kind.map_err(AttachError::NoUprobes)?;
             let events = found.iter().filter_map(|(index, place)| {
@@ -146,7 +146,7 @@ fn places(file: &File, calls: Calls) -> Result<BTreeMap<usize, Place>, AttachErr
         .enumerate()
         .filter_map(|(index, ((program, function), offset))| {
             let offset = (*offset)?;
-            let is_chosen = calls.includes(function) && !Calls::leaves_out(program, has);
+            let is_chosen = calls.includes(function) && !Calls::excludes(program, has);
             is_chosen.then_some((index, Place { function, offset }))
         });
     Ok(found.collect())

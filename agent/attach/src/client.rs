@@ -16,7 +16,9 @@ use rustix::net::{
 use crate::functions::{Calls, Library};
 use crate::mapped::Use;
 use crate::message::{receive, send};
-use crate::request::{Activity, Answer, MAX_PROCESSES, Means, Numbered, PATIENCE, Place, Request};
+use crate::request::{
+    Activity, Answer, AttachMethod, MAX_PROCESSES, Numbered, Place, REQUEST_TIMEOUT, Request,
+};
 use crate::server::Peer;
 use crate::server::answer::answer;
 
@@ -25,7 +27,7 @@ pub const COMMAND: &str = "attach";
 /// Whether this program has [`COMMAND`].
 static HAS_COMMAND: AtomicBool = AtomicBool::new(false);
 /// Maximum time to wait for an answer. The broker itself gives up earlier.
-const ANSWERS_WITHIN: Duration = PATIENCE.saturating_add(Duration::from_secs(1));
+const RESPONSE_TIMEOUT: Duration = REQUEST_TIMEOUT.saturating_add(Duration::from_secs(1));
 /// Pause before another attempt to connect.
 const RETRY: Duration = Duration::from_secs(5);
 
@@ -142,7 +144,7 @@ impl Broker {
 
     /// Closes the connection. The packaged broker ends some time after its last connection has
     /// closed.
-    pub fn rest(&mut self) {
+    pub fn disconnect(&mut self) {
         if matches!(self.reach, Reach::Socket(_)) {
             self.socket = None;
         }
@@ -154,7 +156,7 @@ impl Broker {
     /// Fails if the broker refuses, or cannot be reached.
     pub fn processes(&mut self) -> Result<Vec<u32>, BrokerError> {
         let mut all = Vec::new();
-        self.ask(Request::Processes, &[], |answer, _| {
+        self.request(Request::Processes, &[], |answer, _| {
             if let Answer::Processes(mut part) = answer {
                 all.append(&mut part);
             }
@@ -170,7 +172,7 @@ impl Broker {
         let mut users = Users::default();
         for part in processes.chunks(MAX_PROCESSES) {
             let processes = part.to_vec();
-            self.ask(Request::Uses { library, processes }, &[], |answer, _| {
+            self.request(Request::Uses { library, processes }, &[], |answer, _| {
                 if let Answer::Uses { used, closed } = answer {
                     for (process, part) in used {
                         users.add(process, part);
@@ -190,7 +192,7 @@ impl Broker {
         let mut all = Vec::new();
         for part in processes.chunks(MAX_PROCESSES) {
             let processes = part.to_vec();
-            self.ask(Request::Activities { processes }, &[], |answer, _| {
+            self.request(Request::Activities { processes }, &[], |answer, _| {
                 if let Answer::Activities(mut part) = answer {
                     all.append(&mut part);
                 }
@@ -206,7 +208,7 @@ impl Broker {
     /// Fails if the broker refuses, or cannot be reached.
     pub fn domain(&mut self, process: u32) -> Result<Option<u32>, BrokerError> {
         let mut found = None;
-        self.ask(Request::Domain { process }, &[], |answer, _| {
+        self.request(Request::Domain { process }, &[], |answer, _| {
             if let Answer::Domain(domain) = answer {
                 found = domain;
             }
@@ -221,7 +223,7 @@ impl Broker {
     /// Fails if the broker refuses, or cannot be reached.
     pub fn attach(
         &mut self,
-        (calls, place, means): (Calls, Place, Means),
+        (calls, place, means): (Calls, Place, AttachMethod),
         programs: &[BorrowedFd<'_>],
     ) -> Result<(Vec<OwnedFd>, Vec<String>), BrokerError> {
         let mut attached = None;
@@ -230,7 +232,7 @@ impl Broker {
             place,
             means,
         };
-        self.ask(request, programs, |answer, descriptors| {
+        self.request(request, programs, |answer, descriptors| {
             if let Answer::Attached { functions } = answer {
                 attached = Some((descriptors, functions));
             }
@@ -244,14 +246,14 @@ impl Broker {
     /// Fails if the broker refuses, or cannot be reached.
     pub fn mappings(&mut self) -> Result<Vec<OwnedFd>, BrokerError> {
         let mut events = Vec::new();
-        self.ask(Request::Mappings, &[], |_, descriptors| {
+        self.request(Request::Mappings, &[], |_, descriptors| {
             events = descriptors;
         })?;
         Ok(events)
     }
 
     /// Sends a request, and passes each part of the answer with its descriptors to `with`.
-    fn ask(
+    fn request(
         &mut self,
         request: Request,
         descriptors: &[BorrowedFd<'_>],
@@ -437,7 +439,7 @@ fn open(path: &Path) -> io::Result<OwnedFd> {
 
 fn bounded(socket: &OwnedFd) -> io::Result<()> {
     for timeout in [Timeout::Recv, Timeout::Send] {
-        set_socket_timeout(socket, timeout, Some(ANSWERS_WITHIN))?;
+        set_socket_timeout(socket, timeout, Some(RESPONSE_TIMEOUT))?;
     }
     Ok(())
 }

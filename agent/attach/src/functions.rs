@@ -3,7 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::request::Means;
+use crate::request::AttachMethod;
 
 /// Names of Fast DDS's library: 2.x, 3.x. A version may follow.
 const FAST_DDS: [&str; 2] = ["libfastrtps.so", "libfastdds.so"];
@@ -16,7 +16,7 @@ const PREFIX: &str = "ros_trace_";
 /// callbacks show messages within a process.
 pub const ENQUEUE: &str = "rclcpp_ring_buffer_enqueue";
 /// Program at `callback_start` if only messages are observed and the library lacks [`ENQUEUE`].
-const RECEIVED: (&str, &str) = ("callback_received", "callback_start");
+const RECEPTION_PROGRAM: (&str, &str) = ("callback_received", "callback_start");
 
 /// Functions of messages, with programs of the same name.
 const MESSAGES: [&str; 14] = [
@@ -68,11 +68,12 @@ const RUNTIME: [&str; 10] = [
 /// `SharedMemTransport::copy_to_shared_buffer`, called once per message that goes into shared
 /// memory. Its caller `send` is called for all other messages, too. The parameters follow in the
 /// mangled name.
-pub const COPY: &str = "_ZN8eprosima7fastdds4rtps18SharedMemTransport21copy_to_shared_bufferE";
+pub const FAST_DDS_COPY: &str =
+    "_ZN8eprosima7fastdds4rtps18SharedMemTransport21copy_to_shared_bufferE";
 /// `(unsigned char const*, unsigned int, ..)`: Fast DDS 2.x.
-pub(crate) const WHOLE: &str = "PKhj";
+pub(crate) const CONTIGUOUS_PARAMETERS: &str = "PKhj";
 /// `(std::vector<NetworkBuffer> const&, unsigned int, ..)`: Fast DDS 3.x.
-pub(crate) const LIST: &str = "RKSt6vectorINS1_13NetworkBuffer";
+pub(crate) const BUFFER_LIST_PARAMETERS: &str = "RKSt6vectorINS1_13NetworkBuffer";
 
 /// A library whose users the broker can list.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug, Serialize, Deserialize)]
@@ -132,8 +133,15 @@ impl Calls {
     pub fn programs(self) -> Vec<(&'static str, &'static str)> {
         let same = |name: &&'static str| (*name, *name);
         match self {
-            Self::SharedMemory => vec![("shm_handed", WHOLE), ("shm_handed_list", LIST)],
-            Self::Messages => MESSAGES.iter().map(same).chain([RECEIVED]).collect(),
+            Self::SharedMemory => vec![
+                ("shm_handed", CONTIGUOUS_PARAMETERS),
+                ("shm_handed_list", BUFFER_LIST_PARAMETERS),
+            ],
+            Self::Messages => MESSAGES
+                .iter()
+                .map(same)
+                .chain([RECEPTION_PROGRAM])
+                .collect(),
             Self::Callbacks | Self::Initialization | Self::Runtime => {
                 MESSAGES.iter().chain(&CALLBACKS).map(same).collect()
             }
@@ -143,9 +151,9 @@ impl Calls {
     /// Returns the number of programs that come with a request. With links, one program calls the
     /// others, except for shared memory.
     #[must_use]
-    pub fn expected(self, means: Means) -> usize {
+    pub fn expected(self, means: AttachMethod) -> usize {
         match (self.library(), means) {
-            (Library::Tracing, Means::Links) => 1,
+            (Library::Tracing, AttachMethod::Links) => 1,
             _ => self.programs().len(),
         }
     }
@@ -161,8 +169,8 @@ impl Calls {
 
     /// Returns whether a program is left out, because a program at another function of the library
     /// reports the same.
-    pub(crate) fn leaves_out(program: &str, has: impl Fn(&str) -> bool) -> bool {
-        program == RECEIVED.0 && has(ENQUEUE)
+    pub(crate) fn excludes(program: &str, has: impl Fn(&str) -> bool) -> bool {
+        program == RECEPTION_PROGRAM.0 && has(ENQUEUE)
     }
 }
 
@@ -202,11 +210,11 @@ mod tests {
     fn the_programs_of_callbacks_include_those_of_messages() {
         let callbacks = Calls::Callbacks.programs();
         let mut messages = Calls::Messages.programs();
-        messages.retain(|(program, _)| *program != RECEIVED.0);
+        messages.retain(|(program, _)| *program != RECEPTION_PROGRAM.0);
         assert!(messages.iter().all(|each| callbacks.contains(each)));
-        assert_eq!(Calls::Callbacks.expected(Means::PerfEvents), 25);
-        assert_eq!(Calls::Callbacks.expected(Means::Links), 1);
-        assert_eq!(Calls::SharedMemory.expected(Means::Links), 2);
+        assert_eq!(Calls::Callbacks.expected(AttachMethod::PerfEvents), 25);
+        assert_eq!(Calls::Callbacks.expected(AttachMethod::Links), 1);
+        assert_eq!(Calls::SharedMemory.expected(AttachMethod::Links), 2);
     }
 
     #[test]
@@ -219,6 +227,6 @@ mod tests {
         let is_known = |each: &&str| functions.iter().any(|(_, function)| function == each);
         assert!(RUNTIME.iter().all(is_known));
         assert_eq!(Calls::Runtime.programs(), functions);
-        assert_eq!(Calls::Initialization.expected(Means::Links), 1);
+        assert_eq!(Calls::Initialization.expected(AttachMethod::Links), 1);
     }
 }

@@ -11,21 +11,21 @@ use std::os::unix::fs::FileExt as _;
 
 use ros2probe_wire::{Cursor, Endianness, WireError};
 
-use crate::functions::{COPY as FUNCTION, LIST, WHOLE};
+use crate::functions::{BUFFER_LIST_PARAMETERS, CONTIGUOUS_PARAMETERS, FAST_DDS_COPY as FUNCTION};
 
 const MACHINE: u16 = if cfg!(target_arch = "aarch64") {
     183
 } else {
     62
 };
-const HEADER: usize = 64;
-const SECTION: usize = 64;
-const SEGMENT: usize = 56;
-const SYMBOL: usize = 24;
-const SYMBOL_TABLES: [u32; 2] = [DYNAMIC_SYMBOLS, SYMBOLS];
-const SYMBOLS: u32 = 2;
+const HEADER_LEN: usize = 64;
+const SECTION_LEN: usize = 64;
+const SEGMENT_LEN: usize = 56;
+const SYMBOL_LEN: usize = 24;
+const SYMBOL_TABLES: [u32; 2] = [DYNAMIC_SYMBOLS, SYMBOL_TABLE];
+const SYMBOL_TABLE: u32 = 2;
 const DYNAMIC_SYMBOLS: u32 = 11;
-const LOADED: u32 = 1;
+const LOADED_SEGMENT: u32 = 1;
 const IS_FUNCTION: u8 = 2;
 /// Maximum number of sections, and of segments, in a header table.
 const MAX_ENTRIES: u16 = 1024;
@@ -39,7 +39,7 @@ const MAX_READ: u64 = 2 * (MAX_TABLE + MAX_NAMES);
 const MAX_NAME: usize = 512;
 /// x86-64: `endbr64`, the landing pad of indirect calls. The kernel single-steps a breakpoint on
 /// it, which is slow, but emulates the `push` that follows.
-const LANDING: [u8; 4] = [0xf3, 0x0f, 0x1e, 0xfa];
+const ENDBR64: [u8; 4] = [0xf3, 0x0f, 0x1e, 0xfa];
 
 /// How a library's function receives its message.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
@@ -54,8 +54,8 @@ impl Form {
     /// Returns the start of the mangled parameters.
     pub(crate) const fn parameters(self) -> &'static str {
         match self {
-            Self::Whole => WHOLE,
-            Self::List => LIST,
+            Self::Whole => CONTIGUOUS_PARAMETERS,
+            Self::List => BUFFER_LIST_PARAMETERS,
         }
     }
 }
@@ -122,8 +122,8 @@ pub fn find(file: &File) -> Result<Entry, LibraryError> {
     let header = visit(file, |name, address| {
         let parameters = name.strip_prefix(FUNCTION.as_bytes());
         let form = parameters.and_then(|parameters| match parameters {
-            _ if parameters.starts_with(WHOLE.as_bytes()) => Some(Form::Whole),
-            _ if parameters.starts_with(LIST.as_bytes()) => Some(Form::List),
+            _ if parameters.starts_with(CONTIGUOUS_PARAMETERS.as_bytes()) => Some(Form::Whole),
+            _ if parameters.starts_with(BUFFER_LIST_PARAMETERS.as_bytes()) => Some(Form::List),
             _ => None,
         });
         found = found.or(form.map(|form| (address, form)));
@@ -157,10 +157,10 @@ pub fn functions(file: &File, names: &[&str]) -> Result<Vec<Option<u64>>, Librar
 /// Calls `with` for each function of a library, with the bytes that begin with its name, and its
 /// address.
 fn visit(file: &File, mut with: impl FnMut(&[u8], u64)) -> Result<Header, LibraryError> {
-    let bytes: [u8; HEADER] = array(file, 0)?;
+    let bytes: [u8; HEADER_LEN] = array(file, 0)?;
     let header = Header::read(&bytes)?;
-    let sections = table(file, header.sections, header.section_count, SECTION)?;
-    let (sections, _) = sections.as_chunks::<SECTION>();
+    let sections = table(file, header.sections, header.section_count, SECTION_LEN)?;
+    let (sections, _) = sections.as_chunks::<SECTION_LEN>();
     let sections = sections
         .iter()
         .map(|bytes| section(bytes))
@@ -208,7 +208,8 @@ impl Header {
         let segment_count = cursor.u16("e_phnum")?;
         let section_size = cursor.u16("e_shentsize")?;
         let section_count = cursor.u16("e_shnum")?;
-        let is_known = usize::from(segment_size) == SEGMENT && usize::from(section_size) == SECTION;
+        let is_known =
+            usize::from(segment_size) == SEGMENT_LEN && usize::from(section_size) == SECTION_LEN;
         if !is_known || segment_count.max(section_count) > MAX_ENTRIES {
             return Err(LibraryError::Foreign);
         }
@@ -233,7 +234,7 @@ fn search(
     }
     let symbols = part(file, symbols.offset, symbols.size)?;
     let names = part(file, names.offset, names.size)?;
-    let (symbols, _) = symbols.as_chunks::<SYMBOL>();
+    let (symbols, _) = symbols.as_chunks::<SYMBOL_LEN>();
     for bytes in symbols {
         let mut cursor = Cursor::new(bytes, Endianness::Little);
         let name = cursor.u32("st_name")?;
@@ -255,22 +256,22 @@ fn search(
 
 /// Returns the file offset of the code loaded at this address, after a landing pad.
 fn place(file: &File, header: &Header, address: u64) -> Result<u64, LibraryError> {
-    let segments = table(file, header.segments, header.segment_count, SEGMENT)?;
-    let (segments, _) = segments.as_chunks::<SEGMENT>();
+    let segments = table(file, header.segments, header.segment_count, SEGMENT_LEN)?;
+    let (segments, _) = segments.as_chunks::<SEGMENT_LEN>();
     for bytes in segments {
         let segment = segment(bytes)?;
         let within = address.checked_sub(segment.address);
         let Some(within) = within.filter(|within| *within < segment.size) else {
             continue;
         };
-        if segment.kind != LOADED {
+        if segment.kind != LOADED_SEGMENT {
             continue;
         }
         let offset = segment.offset.checked_add(within);
         let offset = offset.ok_or(LibraryError::Foreign)?;
-        let first: [u8; LANDING.len()] = array(file, offset)?;
-        return Ok(if first == LANDING {
-            offset + LANDING.len() as u64
+        let first: [u8; ENDBR64.len()] = array(file, offset)?;
+        return Ok(if first == ENDBR64 {
+            offset + ENDBR64.len() as u64
         } else {
             offset
         });
@@ -401,7 +402,7 @@ mod tests {
             let entry = |offset| Entry { offset, form };
             let plain = found(&image(&name, &[0x41, 0x54, 0x55, 0x53])).unwrap();
             assert_eq!(plain, entry(0x240));
-            let landing = found(&image(&name, &LANDING)).unwrap();
+            let landing = found(&image(&name, &ENDBR64)).unwrap();
             assert_eq!(landing, entry(0x244));
         }
     }
@@ -411,7 +412,7 @@ mod tests {
         let newer = format!("{FUNCTION}RKNS1_10OtherThingE");
         for name in ["_ZN4sendE", &newer] {
             assert!(matches!(
-                found(&image(name, &LANDING)),
+                found(&image(name, &ENDBR64)),
                 Err(LibraryError::NoSymbol)
             ));
         }
@@ -420,7 +421,7 @@ mod tests {
 
     #[test]
     fn a_truncated_file_is_an_error_and_a_corrupted_one_causes_no_panic() {
-        let good = image(&format!("{FUNCTION}{OF_2}"), &LANDING);
+        let good = image(&format!("{FUNCTION}{OF_2}"), &ENDBR64);
         for length in (0..good.len()).step_by(7) {
             assert!(found(&good[..length]).is_err(), "{length}");
         }
@@ -436,7 +437,7 @@ mod tests {
     #[test]
     fn a_name_without_an_end_is_cut_to_the_maximum_length() {
         let mut file = tempfile::tempfile().unwrap();
-        file.write_all(&image(&"x".repeat(50_000), &LANDING))
+        file.write_all(&image(&"x".repeat(50_000), &ENDBR64))
             .unwrap();
         let mut lengths = Vec::new();
         visit(&file, |name, _| lengths.push(name.len())).unwrap();
@@ -445,13 +446,13 @@ mod tests {
 
     #[test]
     fn tables_beyond_the_budget_of_bytes_are_rejected() {
-        let mut bytes = image(&format!("{FUNCTION}{OF_2}"), &LANDING);
+        let mut bytes = image(&format!("{FUNCTION}{OF_2}"), &ENDBR64);
         let sections = bytes.len() as u64;
         bytes[40..48].copy_from_slice(&sections.to_le_bytes());
         bytes[60..62].copy_from_slice(&21_u16.to_le_bytes());
         let headers = (0..21).map(|number| match number {
             0 => (3_u32, 1_u64),
-            _ => (SYMBOLS, MAX_TABLE),
+            _ => (SYMBOL_TABLE, MAX_TABLE),
         });
         for (kind, size) in headers {
             bytes.extend([0; 4]);

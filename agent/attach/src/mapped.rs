@@ -10,9 +10,9 @@ use crate::functions::Library;
 
 /// Files of Fast DDS's shared memory, which every sender and receiver maps, even if it is linked
 /// statically.
-const SHARED: [&str; 2] = ["/dev/shm/fastrtps_", "/dev/shm/fastdds_"];
+const SHARED_MEMORY_PREFIXES: [&str; 2] = ["/dev/shm/fastrtps_", "/dev/shm/fastdds_"];
 /// Suffix of a replaced or removed file.
-const DELETED: &str = " (deleted)";
+const DELETED_SUFFIX: &str = " (deleted)";
 /// Maximum number of bytes read of one process's map: some forty thousand mappings.
 const MAX_TEXT: u64 = 4 << 20;
 /// Maximum number of files of the library in one process; further ones are left out.
@@ -60,9 +60,11 @@ impl Use {
             let Some(path) = line.find('/').and_then(|at| line.get(at..)) else {
                 continue;
             };
-            found.shares |= SHARED.iter().any(|start| path.starts_with(start));
+            found.shares |= SHARED_MEMORY_PREFIXES
+                .iter()
+                .any(|start| path.starts_with(start));
             let name = path.rsplit('/').next().unwrap_or_default();
-            let is_library = library.has_name(name.strip_suffix(DELETED).unwrap_or(name));
+            let is_library = library.has_name(name.strip_suffix(DELETED_SUFFIX).unwrap_or(name));
             let mut fields = line.split_ascii_whitespace();
             let (range, device, inode) = (fields.next(), fields.nth(2), fields.next());
             let inode = inode.and_then(|inode| inode.parse().ok());

@@ -14,7 +14,7 @@ use serde::de::DeserializeOwned;
 use crate::request::{MAX_DESCRIPTORS, MAX_PACKET};
 
 /// Size of the ancillary data with the maximum number of descriptors, in bytes.
-const ANCILLARY: usize = rustix::cmsg_space!(ScmRights(MAX_DESCRIPTORS));
+const ANCILLARY_BYTES: usize = rustix::cmsg_space!(ScmRights(MAX_DESCRIPTORS));
 
 /// Sends a message in one packet.
 ///
@@ -30,7 +30,7 @@ pub(crate) fn send<T: Serialize>(
     if bytes.len() > MAX_PACKET || descriptors.len() > MAX_DESCRIPTORS {
         return Err(io::ErrorKind::InvalidInput.into());
     }
-    let mut space = [MaybeUninit::uninit(); ANCILLARY];
+    let mut space = [MaybeUninit::uninit(); ANCILLARY_BYTES];
     let mut ancillary = SendAncillaryBuffer::new(&mut space);
     if !descriptors.is_empty() {
         ancillary.push(SendAncillaryMessage::ScmRights(descriptors));
@@ -48,7 +48,7 @@ pub(crate) fn receive<T: DeserializeOwned>(
     socket: BorrowedFd<'_>,
 ) -> io::Result<Option<(T, Vec<OwnedFd>)>> {
     let mut bytes = vec![0; MAX_PACKET];
-    let mut space = [MaybeUninit::uninit(); ANCILLARY];
+    let mut space = [MaybeUninit::uninit(); ANCILLARY_BYTES];
     let mut ancillary = RecvAncillaryBuffer::new(&mut space);
     let flags = RecvFlags::CMSG_CLOEXEC;
     let received = {

@@ -13,7 +13,7 @@ use crate::mapped::{Mapped, Use};
 use crate::request::Place;
 
 /// Flags that keep an open from blocking: a file whose open blocks is not a library.
-const UNBLOCKED: OFlags = OFlags::NONBLOCK.union(OFlags::NOCTTY);
+const NONBLOCKING_FLAGS: OFlags = OFlags::NONBLOCK.union(OFlags::NOCTTY);
 /// Prefix of the names of file systems in user space.
 const USER_SPACE: &str = "fuse";
 /// Maximum number of bytes read of a process's mounts.
@@ -21,7 +21,7 @@ const MAX_MOUNTS: u64 = 1 << 20;
 /// Types of file systems that answer without another process or host (`linux/magic.h`, statfs(2)):
 /// ext4, xfs, btrfs, f2fs, tmpfs, ramfs, squashfs, erofs, ZFS. While the kernel attaches to a file
 /// that never answers, no process of the host can fork.
-const LOCAL: [u32; 9] = [
+const LOCAL_FILE_SYSTEMS: [u32; 9] = [
     0xef53,
     0x5846_5342,
     0x9123_683e,
@@ -33,16 +33,16 @@ const LOCAL: [u32; 9] = [
     0x2fc1_2fc1,
 ];
 /// overlayfs, whose layers may be of any type.
-const OVERLAY: u32 = 0x794c_7630;
+const OVERLAYFS_MAGIC: u32 = 0x794c_7630;
 /// Directories of installed libraries and of ROS distributions.
-const INSTALLED: [&str; 5] = [
+const LIBRARY_DIRECTORIES: [&str; 5] = [
     "/usr/lib/x86_64-linux-gnu",
     "/usr/lib/aarch64-linux-gnu",
     "/usr/lib",
     "/usr/lib64",
     "/usr/local/lib",
 ];
-const DISTRIBUTIONS: &str = "/opt/ros";
+const DISTRIBUTIONS_PATH: &str = "/opt/ros";
 /// Maximum number of ROS distributions whose libraries are listed.
 const MAX_DISTRIBUTIONS: usize = 64;
 
@@ -112,10 +112,13 @@ pub fn installed(library: Library) -> Vec<PathBuf> {
 }
 
 fn directories() -> Vec<PathBuf> {
-    let distributions = fs::read_dir(DISTRIBUTIONS).into_iter().flatten().flatten();
+    let distributions = fs::read_dir(DISTRIBUTIONS_PATH)
+        .into_iter()
+        .flatten()
+        .flatten();
     let distributions = distributions.take(MAX_DISTRIBUTIONS);
     let distributions = distributions.map(|entry| entry.path().join("lib"));
-    INSTALLED
+    LIBRARY_DIRECTORIES
         .iter()
         .map(PathBuf::from)
         .chain(distributions)
@@ -200,7 +203,7 @@ fn check_file_system(file: &File, process: Option<u32>) -> Result<(), OpenError>
         let of = |process| fs::read_link(format!("/proc/{process}/ns/user")).ok();
         own.is_some() && process.is_none_or(|process| of(process) == own)
     };
-    match LOCAL.contains(&kind) || kind == OVERLAY && by_root() {
+    match LOCAL_FILE_SYSTEMS.contains(&kind) || kind == OVERLAYFS_MAGIC && by_root() {
         true => Ok(()),
         false => Err(OpenError::MayNotAnswer(format!("{kind:#x}"))),
     }
@@ -234,7 +237,7 @@ fn file_system<'a>(mounts: &'a str, device: &str) -> Option<&'a str> {
 }
 
 fn flags() -> OFlags {
-    OFlags::RDONLY | OFlags::CLOEXEC | UNBLOCKED
+    OFlags::RDONLY | OFlags::CLOEXEC | NONBLOCKING_FLAGS
 }
 
 fn plain(opened: rustix::io::Result<rustix::fd::OwnedFd>) -> Result<File, OpenError> {

@@ -22,9 +22,9 @@ pub const MAX_PROCESSES: usize = 1024;
 /// Maximum number of descriptors in one packet, `SCM_MAX_FD` of the kernel.
 pub const MAX_DESCRIPTORS: usize = 253;
 /// Time in which a request is answered. A fork that needs longer is killed.
-pub const PATIENCE: Duration = Duration::from_secs(4);
+pub const REQUEST_TIMEOUT: Duration = Duration::from_secs(4);
 /// Time in which a request for an environment is answered. An environment is short.
-const PATIENCE_OF_ENVIRONMENT: Duration = Duration::from_millis(500);
+const ENVIRONMENT_TIMEOUT: Duration = Duration::from_millis(500);
 
 /// A request with its number, which its answers repeat.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -68,7 +68,7 @@ pub enum Request {
         /// The file.
         place: Place,
         /// Means of attaching.
-        means: Means,
+        means: AttachMethod,
     },
     /// Perf events that report which process maps a file, one for each CPU: [`Answer::Mappings`].
     Mappings,
@@ -77,10 +77,10 @@ pub enum Request {
 impl Request {
     /// Returns the time in which the request is answered.
     #[must_use]
-    pub const fn patience(&self) -> Duration {
+    pub const fn timeout(&self) -> Duration {
         match self {
-            Self::Domain { .. } => PATIENCE_OF_ENVIRONMENT,
-            _ => PATIENCE,
+            Self::Domain { .. } => ENVIRONMENT_TIMEOUT,
+            _ => REQUEST_TIMEOUT,
         }
     }
 }
@@ -103,7 +103,7 @@ pub enum Place {
 /// Means of attaching programs to functions.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Means {
+pub enum AttachMethod {
     /// One link for all functions of a library, since Linux 6.6. The cookie of a function is its
     /// index in [`Calls::programs`].
     Links,
@@ -111,7 +111,7 @@ pub enum Means {
     PerfEvents,
 }
 
-impl Means {
+impl AttachMethod {
     /// Returns the best means that this kernel has.
     #[must_use]
     pub fn of_this_kernel() -> Self {

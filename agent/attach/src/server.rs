@@ -39,9 +39,9 @@ pub const ATTACHMENT_BURST: f64 = 250.0;
 /// requests are refused.
 pub const MAX_STUCK: usize = 4;
 /// Pause after the kernel refused a connection or a process.
-const PAUSE: Duration = Duration::from_millis(200);
+const RETRY_DELAY: Duration = Duration::from_millis(200);
 /// Maximum wait of the broker, which then counts its children.
-const ROUND: Duration = Duration::from_secs(1);
+const MAX_WAIT: Duration = Duration::from_secs(1);
 
 /// The peer of a connection (SO_PEERCRED, unix(7)).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -72,7 +72,7 @@ pub fn serve(listener: OwnedFd, users: &[u32], idle: Duration) -> io::Result<()>
         }
         let has_room = connections.len() < MAX_CONNECTIONS;
         let source = has_room.then(|| listening.as_fd());
-        if ready(source, rest.min(ROUND))?
+        if ready(source, rest.min(MAX_WAIT))?
             && let Some(socket) = accept(listening)
         {
             connections.extend(begin(socket, users, &mut listener));
@@ -98,7 +98,7 @@ fn accept(listener: &OwnedFd) -> Option<OwnedFd> {
         Ok(socket) => Some(socket),
         Err(error) => {
             tracing::warn!(%error, "accept failed");
-            std::thread::sleep(PAUSE);
+            std::thread::sleep(RETRY_DELAY);
             None
         }
     }
@@ -134,7 +134,7 @@ fn begin(socket: OwnedFd, users: &[u32], listener: &mut Option<OwnedFd>) -> Opti
         Ok(child) => child,
         Err(error) => {
             tracing::error!(%error, "fork failed");
-            std::thread::sleep(PAUSE);
+            std::thread::sleep(RETRY_DELAY);
             None
         }
     }
@@ -187,8 +187,8 @@ fn ready(source: Option<BorrowedFd<'_>>, limit: Duration) -> io::Result<bool> {
 struct Tokens {
     left: f64,
     rate: f64,
-    most: f64,
-    filled: Instant,
+    capacity: f64,
+    last_refill: Instant,
 }
 
 impl Tokens {
@@ -196,16 +196,16 @@ impl Tokens {
         Self {
             left: most,
             rate,
-            most,
-            filled: Instant::now(),
+            capacity: most,
+            last_refill: Instant::now(),
         }
     }
 
     /// Takes a token, or waits for the next one.
     fn take(&mut self) {
         let now = Instant::now();
-        let new = (now - self.filled).as_secs_f64() * self.rate;
-        (self.left, self.filled) = ((self.left + new).min(self.most), now);
+        let new = (now - self.last_refill).as_secs_f64() * self.rate;
+        (self.left, self.last_refill) = ((self.left + new).min(self.capacity), now);
         self.left -= 1.0;
         if self.left < 0.0 {
             std::thread::sleep(Duration::from_secs_f64(-self.left / self.rate));
@@ -281,7 +281,7 @@ impl Connection {
 
     /// Waits for the answer of a child process, which is killed at its deadline.
     fn finish(&mut self, child: Pid, request: Numbered<Request>) -> io::Result<()> {
-        let (number, patience) = (request.number, request.content.patience());
+        let (number, patience) = (request.number, request.content.timeout());
         let end = pidfd_open(child, PidfdFlags::empty());
         let has_ended = end.is_ok_and(|end| ready(Some(end.as_fd()), patience).unwrap_or(false));
         if has_ended {

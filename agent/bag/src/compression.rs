@@ -26,7 +26,7 @@ pub enum Compression {
 #[derive(Debug, Default)]
 pub struct Progress {
     read: AtomicU64,
-    given_up: AtomicBool,
+    cancelled: AtomicBool,
 }
 
 impl Progress {
@@ -37,14 +37,14 @@ impl Progress {
     }
 
     /// Cancels the compression at its next read; the file stays as it is.
-    pub fn give_up(&self) {
-        self.given_up.store(true, Ordering::Relaxed);
+    pub fn cancel(&self) {
+        self.cancelled.store(true, Ordering::Relaxed);
     }
 
-    /// Returns whether [`Self::give_up`] was called.
+    /// Returns whether [`Self::cancel`] was called.
     #[must_use]
-    pub fn is_given_up(&self) -> bool {
-        self.given_up.load(Ordering::Relaxed)
+    pub fn is_cancelled(&self) -> bool {
+        self.cancelled.load(Ordering::Relaxed)
     }
 }
 
@@ -164,7 +164,7 @@ impl<R: Read> Read for ProgressReader<'_, R> {
         if self.failed.is_some() {
             return Ok(0);
         }
-        if self.progress.is_given_up() {
+        if self.progress.is_cancelled() {
             self.failed = Some(io::Error::other("abandoned"));
             return Ok(0);
         }
@@ -196,33 +196,33 @@ struct SizedFrame<W> {
 }
 
 impl<W: Write> SizedFrame<W> {
-    const HEAD: usize = 6;
+    const HEAD_LEN: usize = 6;
     /// Descriptor flag: a size of 8 bytes follows.
     const SIZE_FLAG: u8 = 0b1100_0000;
     /// Descriptor flags that `ruzstd` does not set: a size, a dictionary or no window.
-    const OTHERWISE: u8 = 0b1110_0011;
+    const UNUSED_FLAGS: u8 = 0b1110_0011;
 
     fn new(inner: W, size: u64) -> Self {
         Self {
             inner,
             size,
-            head: Vec::with_capacity(Self::HEAD + 8),
+            head: Vec::with_capacity(Self::HEAD_LEN + 8),
             failed: None,
         }
     }
 
     fn take(&mut self, mut bytes: &[u8]) -> io::Result<()> {
-        if let Some(missing) = Self::HEAD.checked_sub(self.head.len())
+        if let Some(missing) = Self::HEAD_LEN.checked_sub(self.head.len())
             && missing > 0
         {
             let (head, rest) = bytes.split_at(missing.min(bytes.len()));
             self.head.extend_from_slice(head);
             bytes = rest;
-            if self.head.len() < Self::HEAD {
+            if self.head.len() < Self::HEAD_LEN {
                 return Ok(());
             }
             match self.head.get_mut(4) {
-                Some(descriptor) if *descriptor & Self::OTHERWISE == 0 => {
+                Some(descriptor) if *descriptor & Self::UNUSED_FLAGS == 0 => {
                     *descriptor |= Self::SIZE_FLAG;
                 }
                 _ => return Err(io::Error::other("zstd wrote an unexpected frame header")),
@@ -303,7 +303,7 @@ mod tests {
                 .unwrap();
             assert_eq!(progress.read(), 1_000_000);
         }
-        progress.give_up();
+        progress.cancel();
         for compression in [Compression::None, Compression::Lz4, Compression::Zstd] {
             let source = File::open(&path).unwrap();
             let error = compression.compress_file(&source, &into, &progress);

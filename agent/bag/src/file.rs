@@ -22,7 +22,7 @@ use super::options::Storage;
 use super::read::Scan;
 
 /// Name of the writer in a file's header.
-pub(super) const LIBRARY: &str = concat!("ros2probe ", env!("CARGO_PKG_VERSION"));
+pub(super) const LIBRARY_NAME: &str = concat!("ros2probe ", env!("CARGO_PKG_VERSION"));
 /// Name of the metadata records.
 pub(super) const METADATA_NAME: &str = "rosbag2";
 /// Size of the pieces in which records without chunks are written, in bytes.
@@ -85,7 +85,7 @@ impl FileWriter {
             is_torn: false,
         };
         let mut begin = mcap::MAGIC.to_vec();
-        mcap::header(&mut begin, "ros2", LIBRARY);
+        mcap::header(&mut begin, "ros2", LIBRARY_NAME);
         writer.reserve(0)?;
         writer.append(&[&begin])?;
         writer.write_metadata(metadata)?;
@@ -413,13 +413,13 @@ impl FileWriter {
     fn append(&mut self, pieces: &[&[u8]]) -> io::Result<()> {
         let length: u64 = pieces.iter().map(|piece| piece.len() as u64).sum();
         if self.is_torn {
-            self.cut()?;
+            self.truncate()?;
         }
         for piece in pieces {
             if let Err(error) = self.file.write_all(piece) {
                 // A failing disk may also refuse the truncation. The next write then repeats it.
                 self.is_torn = true;
-                let _ = self.cut();
+                let _ = self.truncate();
                 return Err(error);
             }
         }
@@ -431,7 +431,7 @@ impl FileWriter {
     }
 
     /// Truncates the file to the last complete record.
-    fn cut(&mut self) -> io::Result<()> {
+    fn truncate(&mut self) -> io::Result<()> {
         self.file.set_len(self.position)?;
         self.file.seek(io::SeekFrom::Start(self.position))?;
         self.is_torn = false;

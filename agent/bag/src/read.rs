@@ -21,9 +21,9 @@ use super::{Compression, open_file};
 const MAX_RECORD: u64 = 1 << 30;
 /// Maximum factor by which a file may expand beyond [`Expansion::FREE`]. Recordings stay far below:
 /// a few megabytes of the same byte are rare.
-const FACTOR: u64 = 1024;
+const EXPANSION_FACTOR: u64 = 1024;
 /// Maximum factor by which one chunk or record may expand, since all of it is in memory.
-const FACTOR_IN_MEMORY: u64 = 16;
+const EXPANSION_FACTOR_IN_MEMORY: u64 = 16;
 
 /// Content of a file.
 #[derive(Clone, PartialEq, Eq, Debug, Default)]
@@ -209,7 +209,7 @@ pub fn scan(path: &Path, expansion: Expansion, each: &mut Visitor<'_>) -> Result
     };
     let file = open_file(path).map_err(wrong)?;
     let length = file.metadata().map_err(wrong)?.len();
-    let expands = expansion.limit(length, FACTOR);
+    let expands = expansion.limit(length, EXPANSION_FACTOR);
     let compression = compression(path);
     let reader = compression.reader(BufReader::with_capacity(1 << 16, file));
     let mut records = Records {
@@ -223,7 +223,9 @@ pub fn scan(path: &Path, expansion: Expansion, each: &mut Visitor<'_>) -> Result
         expansion,
         in_memory: match compression {
             Compression::None => u64::MAX,
-            Compression::Lz4 | Compression::Zstd => expansion.limit(length, FACTOR_IN_MEMORY),
+            Compression::Lz4 | Compression::Zstd => {
+                expansion.limit(length, EXPANSION_FACTOR_IN_MEMORY)
+            }
         },
     };
     let mut magic = Vec::new();
@@ -393,8 +395,8 @@ fn read_chunk(
             *left = left.saturating_sub(expanded);
             if records.is_err() && limit < chunk.uncompressed_size {
                 return Err(expands_too_far(match limit == in_memory {
-                    true => FACTOR_IN_MEMORY,
-                    false => FACTOR,
+                    true => EXPANSION_FACTOR_IN_MEMORY,
+                    false => EXPANSION_FACTOR,
                 }));
             }
             records
@@ -495,7 +497,8 @@ enum Next {
 impl Records<'_> {
     /// Returns the number of bytes to which a chunk of this length may expand in memory.
     const fn in_memory(&self, length: usize) -> u64 {
-        self.expansion.limit(length as u64, FACTOR_IN_MEMORY)
+        self.expansion
+            .limit(length as u64, EXPANSION_FACTOR_IN_MEMORY)
     }
 
     fn next(&mut self, content: &mut Vec<u8>) -> io::Result<Next> {
@@ -530,10 +533,10 @@ impl Records<'_> {
         self.position += read;
         self.left -= read;
         if read < length && read == self.in_memory {
-            return Err(expands_too_far(FACTOR_IN_MEMORY));
+            return Err(expands_too_far(EXPANSION_FACTOR_IN_MEMORY));
         }
         if read < length && self.left == 0 {
-            return Err(expands_too_far(FACTOR));
+            return Err(expands_too_far(EXPANSION_FACTOR));
         }
         match result {
             Err(error)

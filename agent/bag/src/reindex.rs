@@ -154,8 +154,8 @@ fn files(directory: &Path) -> Result<Vec<String>, ReindexError> {
     Ok(names)
 }
 
-/// Returns the number of a file: `12` for `bag_12.mcap`, and for `12_bag_2026_05_22-10_11_58.mcap`, as
-/// Lyrical names it. Files without a number are first.
+/// Returns the number of a file: `12` for `bag_12.mcap`, and for `12_bag_2026_05_22-10_11_58.mcap`,
+/// as Lyrical names it. Files without a number are first.
 fn number(name: &str) -> Option<u64> {
     let (stem, _) = name.split_once(".mcap")?;
     match stem.split_once('_') {
@@ -166,10 +166,10 @@ fn number(name: &str) -> Option<u64> {
 
 /// Returns whether a name ends with a time, `YYYY_MM_DD-HH_MM_SS`.
 fn ends_with_time(name: &str) -> bool {
-    const SHAPE: &[u8; 19] = b"0000_00_00-00_00_00";
+    const TIME_SHAPE: &[u8; 19] = b"0000_00_00-00_00_00";
     let time = name.as_bytes().last_chunk::<19>();
     time.is_some_and(|time| {
-        let mut pairs = SHAPE.iter().zip(time);
+        let mut pairs = TIME_SHAPE.iter().zip(time);
         pairs.all(|(shape, byte)| match shape {
             b'0' => byte.is_ascii_digit(),
             _ => byte == shape,
@@ -232,7 +232,7 @@ fn write_part(path: &Path, part: &Path, scan: &Scan) -> io::Result<Found> {
     let cut = cut_bytes(&mut source, scan)?;
     writer.finish(std::iter::empty())?;
     writer.sync()?;
-    let kept = keep_aside(path, &mut source, scan)?;
+    let kept = save_remainder(path, &mut source, scan)?;
     fs::rename(part, path)?;
     Ok(Found::Unfinished {
         salvaged,
@@ -258,7 +258,7 @@ fn cut_bytes(source: &mut File, scan: &Scan) -> io::Result<u64> {
 }
 
 /// Copies the bytes after the last complete record into a file beside it, for manual recovery.
-fn keep_aside(path: &Path, source: &mut File, scan: &Scan) -> io::Result<Option<String>> {
+fn save_remainder(path: &Path, source: &mut File, scan: &Scan) -> io::Result<Option<String>> {
     if cut_bytes(source, scan)? == 0 {
         return Ok(None);
     }

@@ -22,7 +22,7 @@ use row::Value;
 /// QoS.
 const PREFIX: usize = 1024;
 /// Maximum length of the name of a topic or type, in bytes.
-const NAME: usize = 256;
+const MAX_NAME: usize = 256;
 
 /// Reads all messages. Returns the number of damaged pages and rows.
 pub(super) fn read(path: &Path, each: &mut dyn FnMut(&Message<'_>)) -> io::Result<u64> {
@@ -59,7 +59,7 @@ pub(super) fn read(path: &Path, each: &mut dyn FnMut(&Message<'_>)) -> io::Resul
             .and_then(Value::text)
             .zip(type_name.and_then(Value::text));
         if let Some((name, type_name)) = texts
-            && name.len().max(type_name.len()) <= NAME
+            && name.len().max(type_name.len()) <= MAX_NAME
         {
             named.insert(id, (name.to_owned(), type_name.to_owned()));
         }

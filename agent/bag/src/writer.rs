@@ -62,7 +62,7 @@ pub struct Writer {
     by_name: HashMap<String, TopicId>,
     schemas: HashMap<(String, Option<Schema>), u16>,
     /// Complete files; `current` follows them.
-    done: Vec<DoneFile>,
+    complete_files: Vec<DoneFile>,
     current: Option<FileWriter>,
     /// Files to be compressed.
     uncompressed: Vec<FileCompression>,
@@ -126,7 +126,7 @@ impl Writer {
             topics: Vec::new(),
             by_name: HashMap::new(),
             schemas: HashMap::new(),
-            done: Vec::new(),
+            complete_files: Vec::new(),
             current: None,
             uncompressed: Vec::new(),
             unwritten: BTreeMap::new(),
@@ -170,7 +170,7 @@ impl Writer {
                 });
             }
             if topic.is_written {
-                topic.later = Some(description.publishers);
+                topic.latest_qos = Some(description.publishers);
             } else {
                 // The schema already has its id.
                 let schema = topic.description.schema.take();
@@ -205,7 +205,7 @@ impl Writer {
             schema_id,
             messages: 0,
             is_written: false,
-            later: None,
+            latest_qos: None,
         });
         Ok(TopicId(index))
     }
@@ -288,7 +288,7 @@ impl Writer {
     /// [`Self::unwritten`] counts them.
     pub fn settle(&mut self) {
         if matches!(self.current.as_mut().map(FileWriter::flush), Some(Err(_))) {
-            self.give_up_waiting();
+            self.cancel_compression();
         }
     }
 
@@ -323,7 +323,7 @@ impl Writer {
         self.options.custom_data.extend(custom_data);
         let mut refused = None;
         if let Err(error) = self.finish_file() {
-            self.give_up_waiting();
+            self.cancel_compression();
             // Without the summary a file is still readable, and `rp bag reindex` completes it.
             if self.finish_file().is_err() {
                 self.abandon_file();
@@ -357,7 +357,7 @@ impl Writer {
 
     /// Records that a file is compressed.
     pub fn compressed(&mut self, done: &Compressed) -> Result<(), Error> {
-        if let Some(file) = self.done.get_mut(done.index) {
+        if let Some(file) = self.complete_files.get_mut(done.index) {
             file.compression = done.compression;
             file.bytes = done.bytes;
         }
@@ -368,20 +368,30 @@ impl Writer {
     #[must_use]
     pub fn bytes(&self) -> u64 {
         let current = self.current.as_ref().map_or(0, FileWriter::position);
-        current + self.done.iter().map(|file| file.bytes).sum::<u64>()
+        current
+            + self
+                .complete_files
+                .iter()
+                .map(|file| file.bytes)
+                .sum::<u64>()
     }
 
     /// Returns the same as [`Self::bytes`], plus the bytes that are not written yet.
     #[must_use]
     pub fn expected_bytes(&self) -> u64 {
         let current = self.current.as_ref().map_or(0, FileWriter::expected_bytes);
-        current + self.done.iter().map(|file| file.bytes).sum::<u64>()
+        current
+            + self
+                .complete_files
+                .iter()
+                .map(|file| file.bytes)
+                .sum::<u64>()
     }
 
     /// Returns the number of files begun so far.
     #[must_use]
     pub fn files(&self) -> usize {
-        self.done.len() + usize::from(self.current.is_some())
+        self.complete_files.len() + usize::from(self.current.is_some())
     }
 
     fn is_due(&self, log_time: Timestamp) -> bool {
@@ -402,7 +412,9 @@ impl Writer {
     }
 
     fn open_file(&mut self) -> Result<(), Error> {
-        let path = self.directory.join(self.file_name(self.done.len()));
+        let path = self
+            .directory
+            .join(self.file_name(self.complete_files.len()));
         let begin = self.metadata_record();
         let file = FileWriter::create(&path, self.options.storage, &begin);
         match file {
@@ -456,8 +468,8 @@ impl Writer {
                 .copied()
                 .unwrap_or(0);
         }
-        let index = self.done.len();
-        self.done.push(DoneFile {
+        let index = self.complete_files.len();
+        self.complete_files.push(DoneFile {
             name: self.file_name(index),
             compression: Compression::None,
             times: current.times(),
@@ -473,7 +485,7 @@ impl Writer {
         }
     }
 
-    fn give_up_waiting(&mut self) {
+    fn cancel_compression(&mut self) {
         if let Some(current) = &mut self.current {
             for (channel, (messages, bytes)) in current.discard() {
                 let unwritten = self.unwritten.entry(channel).or_default();
@@ -489,13 +501,13 @@ impl Writer {
 
     fn metadata(&self) -> Metadata {
         let current = self.current.as_ref().map(|current| DoneFile {
-            name: self.file_name(self.done.len()),
+            name: self.file_name(self.complete_files.len()),
             compression: Compression::None,
             times: current.times(),
             messages: current.messages(),
             bytes: current.position(),
         });
-        let files: Vec<&DoneFile> = self.done.iter().chain(&current).collect();
+        let files: Vec<&DoneFile> = self.complete_files.iter().chain(&current).collect();
         let times = times(&files);
         let compression = files.iter().map(|file| file.compression);
         let compression = compression.max_by_key(|compression| *compression != Compression::None);
@@ -535,7 +547,7 @@ impl Writer {
     fn custom_data(&self) -> BTreeMap<String, String> {
         let mut data = self.options.custom_data.clone();
         for topic in &self.topics {
-            if let Some(publishers) = &topic.later
+            if let Some(publishers) = &topic.latest_qos
                 && *publishers != topic.description.publishers
             {
                 let key = format!("ros2probe.later_qos_profiles {}", topic.description.name);
@@ -566,7 +578,7 @@ impl Writer {
     }
 
     fn summary(&self) -> Summary {
-        let files: Vec<&DoneFile> = self.done.iter().collect();
+        let files: Vec<&DoneFile> = self.complete_files.iter().collect();
         let topics = self.topics.iter().map(|topic| TopicSummary {
             name: topic.description.name.clone(),
             messages: topic.messages,

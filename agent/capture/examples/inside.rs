@@ -14,7 +14,7 @@ use std::time::Duration;
 
 use ros2probe_attach::client::Broker;
 use ros2probe_attach::library;
-use ros2probe_capture::breakpoints::Means;
+use ros2probe_capture::breakpoints::AttachMethod;
 use ros2probe_capture::inside::programs;
 use ros2probe_capture::inside::table::ProcessTable;
 use ros2probe_capture::system::Clocks;
@@ -49,7 +49,8 @@ fn main() {
 }
 
 fn check(library: &str, has_callbacks: bool) -> Result<String, Box<dyn Error>> {
-    let (programs, mut tables) = programs::load(has_callbacks, None, Means::of_this_kernel())?;
+    let (programs, mut tables) =
+        programs::load(has_callbacks, None, AttachMethod::of_this_kernel())?;
     tables.set_clocks(&Clocks::read())?;
     let file = File::open(library)?;
     let attached = programs.attach_here(&file)?;

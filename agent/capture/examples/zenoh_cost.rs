@@ -109,7 +109,7 @@ fn main() {
     let rounds = arguments.next().unwrap_or(7);
     let duration = Duration::from_secs(arguments.next().unwrap_or(2));
     let cgroup = Cgroup::create(&format!("rp-zenoh-cost-{}", std::process::id())).unwrap();
-    let host = Namespace::alone().unwrap();
+    let host = Namespace::isolated().unwrap();
     let mut ratios = [Vec::new(), Vec::new()];
     for round in 0..rounds {
         let mut results = [[0.0; 2]; 2];

@@ -18,11 +18,11 @@ const LIFETIME_NANOSECONDS: i64 = 30_000_000_000;
 
 /// A complete item for the model.
 #[derive(Debug)]
-pub enum Ready {
+pub enum ReadyItem {
     /// A record of a complete datagram.
     Record(Record),
     /// The rest of a complete datagram that the kernel filter handed over.
-    Rest(Reassembled),
+    Remainder(Reassembled),
 }
 
 /// Datagrams that are not complete yet.
@@ -31,7 +31,7 @@ pub struct Ahead {
     waiting: HashMap<Token, Waiting>,
     oldest: Bounded<AheadDatagrams, VecDeque<(Timestamp, Token)>>,
     bytes: Sum<AheadBytes>,
-    given_up: u64,
+    discarded: u64,
 }
 
 /// A datagram's source and token.
@@ -41,7 +41,7 @@ type Token = (u32, u32);
 struct Waiting {
     records: Bounded<AheadRecords, Vec<Record>>,
     handed_over: bool,
-    rest: Option<Reassembled>,
+    remainder: Option<Reassembled>,
     /// Time of the frame that completed the datagram.
     complete: Option<u64>,
 }
@@ -49,16 +49,16 @@ struct Waiting {
 impl Ahead {
     /// Accepts a record of source `namespace`. The caller passes handovers to the reassembly; here
     /// a handover only announces that the rest of the datagram follows.
-    pub fn record(&mut self, namespace: u32, record: Record, ready: impl FnMut(Ready)) {
+    pub fn record(&mut self, namespace: u32, record: Record, ready: impl FnMut(ReadyItem)) {
         let mut ready = ready;
         if record.datagram == 0 {
-            return ready(Ready::Record(record));
+            return ready(ReadyItem::Record(record));
         }
         let token = (namespace, record.datagram);
         if record.flags & flag::AHEAD == 0 && !self.waiting.contains_key(&token) {
             // The usual case: a single record of a complete datagram.
             if !matches!(record.body(), Body::Complete) {
-                ready(Ready::Record(record));
+                ready(ReadyItem::Record(record));
             }
             return;
         }
@@ -74,20 +74,25 @@ impl Ahead {
                 waiting.complete = Some(record.time);
             }
         });
-        self.settle(token, ready);
+        self.complete_datagram(token, ready);
     }
 
     /// Accepts the rest of a handed-over datagram.
-    pub fn rest(&mut self, namespace: u32, rest: Reassembled, ready: impl FnMut(Ready)) {
+    pub fn add_remainder(
+        &mut self,
+        namespace: u32,
+        rest: Reassembled,
+        ready: impl FnMut(ReadyItem),
+    ) {
         let Some(handover) = rest.handover else {
             return;
         };
         let token = (namespace, handover.datagram);
         self.change(token, rest.last_seen, |waiting| {
             waiting.handed_over = true;
-            waiting.rest = Some(rest);
+            waiting.remainder = Some(rest);
         });
-        self.settle(token, ready);
+        self.complete_datagram(token, ready);
     }
 
     /// Discards datagrams that can no longer become complete.
@@ -95,21 +100,21 @@ impl Ahead {
         let is_late =
             |(born, _): &mut (Timestamp, _)| now.nanoseconds_since(*born) > LIFETIME_NANOSECONDS;
         while let Some(oldest) = self.oldest.pop_front_if(is_late) {
-            self.give_up(Some(oldest));
+            self.discard(Some(oldest));
         }
     }
 
     /// Returns the number of datagrams that never became complete or did not fit.
     #[must_use]
-    pub const fn given_up(&self) -> u64 {
-        self.given_up
+    pub const fn discarded(&self) -> u64 {
+        self.discarded
     }
 
     /// Changes the waiting datagram, and gives up the oldest datagrams if a bound is exceeded.
     fn change(&mut self, token: Token, at: Timestamp, change: impl FnOnce(&mut Waiting)) {
         if !self.waiting.contains_key(&token) {
             let oldest = self.oldest.push_back((at, token));
-            self.give_up(oldest);
+            self.discard(oldest);
         }
         let waiting = self.waiting.entry(token).or_default();
         let before = waiting.bytes();
@@ -118,13 +123,13 @@ impl Ahead {
         self.bytes.add(waiting.bytes());
         while self.bytes.is_exceeded() && !self.oldest.is_empty() {
             let oldest = self.oldest.pop_front();
-            self.give_up(oldest);
+            self.discard(oldest);
         }
     }
 
-    fn give_up(&mut self, oldest: Option<(Timestamp, Token)>) {
+    fn discard(&mut self, oldest: Option<(Timestamp, Token)>) {
         if let Some((_, oldest)) = oldest {
-            self.given_up += u64::from(self.remove(oldest).is_some());
+            self.discarded += u64::from(self.remove(oldest).is_some());
         }
     }
 
@@ -134,26 +139,26 @@ impl Ahead {
         Some(waiting)
     }
 
-    fn settle(&mut self, token: Token, mut ready: impl FnMut(Ready)) {
+    fn complete_datagram(&mut self, token: Token, mut ready: impl FnMut(ReadyItem)) {
         let Some(waiting) = self.waiting.get(&token) else {
             return;
         };
         let Some(time) = waiting.complete else { return };
-        if waiting.handed_over && waiting.rest.is_none() {
+        if waiting.handed_over && waiting.remainder.is_none() {
             return;
         }
         let Some(waiting) = self.remove(token) else {
             return;
         };
         for record in waiting.records {
-            ready(Ready::Record(Record {
+            ready(ReadyItem::Record(Record {
                 time,
                 flags: record.flags & !flag::AHEAD,
                 ..record
             }));
         }
-        if let Some(rest) = waiting.rest {
-            ready(Ready::Rest(rest));
+        if let Some(rest) = waiting.remainder {
+            ready(ReadyItem::Remainder(rest));
         }
     }
 }
@@ -165,10 +170,10 @@ impl Waiting {
         let Self {
             records,
             handed_over: _,
-            rest,
+            remainder: rest,
             complete: _,
         } = self;
-        let rest = rest.as_ref().map_or(0, Reassembled::held);
+        let rest = rest.as_ref().map_or(0, Reassembled::held_bytes);
         records.capacity() * size_of::<Record>() + rest
     }
 }
@@ -193,8 +198,8 @@ mod tests {
     fn taken(ahead: &mut Ahead, record: Record) -> Vec<Record> {
         let mut all = Vec::new();
         ahead.record(0, record, |ready| match ready {
-            Ready::Record(record) => all.push(record),
-            Ready::Rest(_) => unreachable!("nothing was handed over"),
+            ReadyItem::Record(record) => all.push(record),
+            ReadyItem::Remainder(_) => unreachable!("nothing was handed over"),
         });
         all
     }
@@ -204,7 +209,7 @@ mod tests {
         let mut ahead = Ahead::default();
         assert!(taken(&mut ahead, record(9, kind::DATA, flag::AHEAD, 1)).is_empty());
         ahead.advance(Timestamp(31_000_000_000));
-        assert_eq!(ahead.given_up(), 1);
+        assert_eq!(ahead.discarded(), 1);
         assert!(taken(&mut ahead, record(9, kind::COMPLETE, 0, 2)).is_empty());
     }
 
@@ -254,7 +259,7 @@ mod tests {
         let held: usize = ahead.waiting.values().map(Waiting::bytes).sum();
         assert_eq!(ahead.bytes.used(), held);
         assert_driven::<AheadBytes>();
-        assert_eq!(ahead.given_up(), 999 - ahead.waiting.len() as u64);
+        assert_eq!(ahead.discarded(), 999 - ahead.waiting.len() as u64);
     }
 
     #[test]

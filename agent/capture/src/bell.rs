@@ -1,5 +1,5 @@
 //! Wakes a thread that waits for packets: a descriptor that is readable after [`Bell::ring`] until
-//! [`Bell::silence`]. It signals that an event occurred, not which one.
+//! [`Bell::drain`]. It signals that an event occurred, not which one.
 //!
 //! It uses `read` and `write`, which the system call filter of each thread allows. The standard
 //! library reads sockets by `recvfrom`, which most filters refuse.
@@ -9,8 +9,8 @@ use std::os::fd::{AsFd as _, BorrowedFd};
 use std::os::unix::net::UnixStream;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// Maximum number of rings that one call of [`Bell::silence`] takes.
-const RINGS: usize = 64;
+/// Maximum number of rings that one call of [`Bell::drain`] takes.
+const MAX_RINGS: usize = 64;
 
 /// A bell that any thread may ring or wait for.
 #[derive(Debug)]
@@ -50,12 +50,12 @@ impl Bell {
     }
 
     /// Silences the bell if it rang at most 64 times; otherwise it keeps ringing.
-    pub fn silence(&self) {
+    pub fn drain(&self) {
         if !self.rung.swap(false, Ordering::AcqRel) {
             return;
         }
-        let read = rustix::io::read(&self.listener, &mut [0; RINGS]);
-        if read.is_ok_and(|rings| rings == RINGS) {
+        let read = rustix::io::read(&self.listener, &mut [0; MAX_RINGS]);
+        if read.is_ok_and(|rings| rings == MAX_RINGS) {
             self.rung.store(true, Ordering::Release);
         }
     }
@@ -71,17 +71,17 @@ mod tests {
     fn a_bell_with_many_rings_is_silent_after_several_calls_and_can_ring_again() {
         let bell = Bell::new().unwrap();
         let rings = || wait(&[bell.descriptor()], Duration::ZERO).unwrap() == Some(0);
-        bell.silence();
+        bell.drain();
         assert!(!rings());
-        for _ in 0..3 * RINGS {
+        for _ in 0..3 * MAX_RINGS {
             bell.ring();
         }
         for _ in 0..3 {
             assert!(rings());
-            bell.silence();
+            bell.drain();
         }
         assert!(!rings());
-        bell.silence();
+        bell.drain();
         bell.ring();
         assert!(rings());
     }

@@ -25,7 +25,7 @@ use crate::bpf;
 use crate::filter::FilterError;
 use crate::uprobe::attachments::Refusal;
 
-pub use ros2probe_attach::request::Means;
+pub use ros2probe_attach::request::AttachMethod;
 
 /// A program that tail-calls another one: the cookie of a function is its index in a program array.
 #[derive(Clone, Copy)]
@@ -39,7 +39,7 @@ pub(crate) struct Breakpoints {
     pub(crate) ebpf: Ebpf,
     /// Functions that have a loaded program.
     pub(crate) calls: Calls,
-    means: Means,
+    method: AttachMethod,
     /// Programs for links, in the order of [`Calls::programs`]. Programs for perf events are in
     /// `ebpf`.
     linked: Vec<OwnedFd>,
@@ -68,10 +68,10 @@ impl Breakpoints {
         object: &[u8],
         calls: Calls,
         dispatcher: Option<Dispatcher>,
-        means: Means,
+        means: AttachMethod,
     ) -> Result<Self, FilterError> {
         let names = calls.programs().into_iter().map(|(name, _)| name);
-        if means == Means::PerfEvents {
+        if means == AttachMethod::PerfEvents {
             for name in names {
                 let program = ebpf.program_mut(name).ok_or(FilterError::Missing(name))?;
                 let program: &mut UProbe = program.try_into().map_err(FilterError::Program)?;
@@ -80,7 +80,7 @@ impl Breakpoints {
             return Ok(Self {
                 ebpf,
                 calls,
-                means,
+                method: means,
                 linked: Vec::new(),
                 dispatching: None,
             });
@@ -105,14 +105,14 @@ impl Breakpoints {
             dispatching: dispatching.transpose()?,
             ebpf,
             calls,
-            means,
+            method: means,
             linked,
         })
     }
 
     /// Returns the loaded programs, in the order of [`Calls::programs`].
     pub(crate) fn programs(&self) -> Result<Vec<BorrowedFd<'_>>, FilterError> {
-        if self.means == Means::Links {
+        if self.method == AttachMethod::Links {
             return Ok(self.linked.iter().map(|program| program.as_fd()).collect());
         }
         let programs = self.calls.programs().into_iter().map(|(name, _)| {
@@ -137,13 +137,13 @@ impl Breakpoints {
         let attached = match &self.dispatching {
             Some(dispatching) => {
                 let programs = [dispatching.program.as_fd()];
-                broker.attach((calls, place, self.means), &programs)
+                broker.attach((calls, place, self.method), &programs)
             }
             None => {
                 let programs = self
                     .programs()
                     .map_err(|error| Refusal::Program(error.into()))?;
-                broker.attach((calls, place, self.means), &programs)
+                broker.attach((calls, place, self.method), &programs)
             }
         };
         let (descriptors, functions) = attached?;
@@ -165,7 +165,7 @@ impl Breakpoints {
             Some(program) => vec![program],
             None => programs,
         };
-        let attached = attach::attach(file, calls, self.means, &programs)?;
+        let attached = attach::attach(file, calls, self.method, &programs)?;
         Ok(Attached {
             _descriptors: attached.descriptors,
             functions: attached.functions,

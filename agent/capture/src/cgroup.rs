@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 
 use super::container::{CGROUP_OPTIONS, otherwise};
 
-const MOUNTS: &str = "/proc/self/mountinfo";
+const MOUNTS_PATH: &str = "/proc/self/mountinfo";
 /// Inode of the root group, which is its id and the same on every host.
 const ROOT_INODE: u64 = 1;
 
@@ -20,7 +20,7 @@ const ROOT_INODE: u64 = 1;
 #[derive(Debug, thiserror::Error)]
 pub enum CgroupError {
     /// The list of mounts cannot be read.
-    #[error("cannot read {MOUNTS}")]
+    #[error("cannot read {MOUNTS_PATH}")]
     Mounts(#[source] io::Error),
     /// Only v1 is mounted, or no hierarchy at all.
     #[error(
@@ -110,7 +110,7 @@ impl Cgroup {
 /// # Errors
 /// Fails if no hierarchy is mounted.
 pub fn mount_point() -> Result<PathBuf, CgroupError> {
-    let mounts = fs::read(MOUNTS).map_err(CgroupError::Mounts)?;
+    let mounts = fs::read(MOUNTS_PATH).map_err(CgroupError::Mounts)?;
     topmost(&mounts).ok_or(CgroupError::NotMounted)
 }
 

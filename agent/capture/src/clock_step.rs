@@ -98,7 +98,7 @@ mod tests {
             let before = clocks(4 * SECOND + SECOND / 2, 0).now;
             assert_eq!(now.stamped(before), half, "before the step");
             assert_eq!(now.stamped(half), half, "after it");
-            assert_eq!(now.stamped(Timestamp(1)), now.now, "of neither calendar");
+            assert_eq!(now.stamped(Timestamp(1)), now.now, "of neither clock");
         }
     }
 }

@@ -8,11 +8,11 @@ use std::fs;
 use std::path::Path;
 
 /// Files that Docker and podman create in each container.
-const MARKS: [&str; 2] = ["/.dockerenv", "/run/.containerenv"];
+const MARKER_FILES: [&str; 2] = ["/.dockerenv", "/run/.containerenv"];
 /// Variable of the container interface of systemd. The image has it as well.
-const VARIABLE: &str = "container";
+const CONTAINER_VARIABLE: &str = "container";
 /// Its values for containers that are started with options, unlike those of systemd-nspawn or LXC.
-const ENGINES: [&str; 3] = ["docker", "oci", "podman"];
+const CONTAINER_ENGINES: [&str; 3] = ["docker", "oci", "podman"];
 /// Options that show the host's control groups.
 pub const CGROUP_OPTIONS: &str = "--cgroupns host --volume /sys/fs/cgroup:/sys/fs/cgroup:ro";
 /// Address families of sockets at interfaces, as a line of a unit.
@@ -25,16 +25,20 @@ const HOST_USERS: &str = "user:[4026531837]";
 const HOST_PROCESSES: &str = "pid:[4026531836]";
 /// A setting that only the host's network namespace has.
 const HOST_NETWORK: &str = "/proc/sys/net/core/netdev_max_backlog";
-const MOUNTS: &str = "/proc/self/mountinfo";
+const MOUNTS_PATH: &str = "/proc/self/mountinfo";
 /// Mounts of the first process, which is the host's unless the process ids are the container's own.
 pub const FIRST_MOUNTS: &str = "/proc/1/mountinfo";
 
-/// Returns whether this process is in a container of Docker, podman or Kubernetes. A mark alone is no
-/// evidence, as virtual machines are made of images too.
+/// Returns whether this process is in a container of Docker, podman or Kubernetes. A mark alone is
+/// no evidence, as virtual machines are made of images too.
 #[must_use]
 pub fn is_container() -> bool {
-    let engine = std::env::var(VARIABLE).is_ok_and(|value| ENGINES.contains(&value.as_str()));
-    let is_marked = engine || MARKS.into_iter().any(|path| Path::new(path).exists());
+    let engine = std::env::var(CONTAINER_VARIABLE)
+        .is_ok_and(|value| CONTAINER_ENGINES.contains(&value.as_str()));
+    let is_marked = engine
+        || MARKER_FILES
+            .into_iter()
+            .any(|path| Path::new(path).exists());
     is_marked && (has_own_processes() || has_own_root())
 }
 
@@ -42,7 +46,7 @@ pub fn is_container() -> bool {
 /// ids of its own, a container's first process has the same.
 fn has_own_root() -> bool {
     let read = |path| fs::read_to_string(path).unwrap_or_default();
-    mount_of("/", &read(MOUNTS)) != mount_of("/", &read(FIRST_MOUNTS))
+    mount_of("/", &read(MOUNTS_PATH)) != mount_of("/", &read(FIRST_MOUNTS))
 }
 
 /// Returns whether this process is a service of systemd that reports its state: no shell has this
@@ -127,7 +131,7 @@ mod tests {
 
     #[test]
     fn this_process_is_in_a_mount_namespace_with_a_root() {
-        let mounts = fs::read_to_string(MOUNTS).unwrap();
+        let mounts = fs::read_to_string(MOUNTS_PATH).unwrap();
         assert!(mount_of("/", &mounts).is_some(), "{mounts}");
     }
 }

@@ -22,7 +22,7 @@ impl Reason {
 }
 
 /// What precedes the verifier's log in errors of aya.
-const VERIFIER: &str = "Verifier output: ";
+const VERIFIER_PREFIX: &str = "Verifier output: ";
 
 /// Returns an error and its causes in one line. Of a verifier's log, only the reason is included.
 #[must_use]
@@ -46,7 +46,7 @@ pub fn in_words(error: &dyn Error) -> String {
 /// Returns the first line of a message. The last line of a verifier's log before its statistics is
 /// the reason, and the first ones are remarks.
 fn line(message: &str) -> String {
-    let Some((cause, log)) = message.split_once(VERIFIER) else {
+    let Some((cause, log)) = message.split_once(VERIFIER_PREFIX) else {
         return message.lines().next().unwrap_or_default().to_owned();
     };
     let statistics = ["processed ", "verification time ", "stack depth "];
@@ -55,7 +55,7 @@ fn line(message: &str) -> String {
         !line.is_empty() && !statistics.iter().any(|start| line.starts_with(start))
     };
     let reason = log.lines().rev().find(is_reason).unwrap_or_default();
-    format!("{cause}{VERIFIER}{}", reason.trim())
+    format!("{cause}{VERIFIER_PREFIX}{}", reason.trim())
 }
 
 #[cfg(test)]

@@ -174,7 +174,7 @@ impl Filter {
     /// Returns [`FilterError::NotPermitted`] without the capabilities, other errors if the kernel
     /// refuses it.
     pub fn load(settings: &FilterSettings) -> Result<Self, FilterError> {
-        let mut sizes = vec![("PIECES", page_size()), ("SOCKETS", UNUSED)];
+        let mut sizes = vec![("PIECES", page_size()), ("SOCKETS", UNUSED_MAP_ENTRIES)];
         sizes.extend(NO_DELIVERIES);
         let mut ebpf = open(settings, false, &sizes, None, 0)?;
         let program = load_program(&mut ebpf, "wire")?;
@@ -431,14 +431,14 @@ fn caused_by(error: &(dyn std::error::Error + 'static), wanted: i32) -> Option<i
 }
 
 /// Number of entries of a map that the loaded programs do not use: an LRU map cannot be empty.
-const UNUSED: u32 = 64;
+const UNUSED_MAP_ENTRIES: u32 = 64;
 
 /// Sizes of the maps of deliveries where they are not followed.
 const NO_DELIVERIES: [(&str, u32); 4] = [
-    ("QUEUES", UNUSED),
-    ("QUEUED", UNUSED),
-    ("DELIVERIES", UNUSED),
-    ("SENT", UNUSED),
+    ("QUEUES", UNUSED_MAP_ENTRIES),
+    ("QUEUED", UNUSED_MAP_ENTRIES),
+    ("DELIVERIES", UNUSED_MAP_ENTRIES),
+    ("SENT", UNUSED_MAP_ENTRIES),
 ];
 
 /// Opens the object and creates its maps with the given `sizes`. `host` selects the host hook.

@@ -97,7 +97,7 @@ impl FilterReader {
         self.pieces.advance(clocks.monotonic);
         let now = Timestamp(clocks.now.0.saturating_sub(SETTLE_NANOSECONDS));
         self.streams
-            .advance(now, |streamed| streamed.pass(observer));
+            .advance(now, |streamed| streamed.pass_to(observer));
     }
 
     /// Passes all buffered data to the model at the end.
@@ -146,7 +146,7 @@ impl FilterReader {
     /// Returns the number of captured datagrams that never became complete.
     #[must_use]
     pub const fn incomplete_datagrams(&self) -> u64 {
-        self.pieces.given_up()
+        self.pieces.discarded()
     }
 
     /// Returns the bytes held for datagrams that are incomplete or wait.
@@ -178,7 +178,7 @@ impl FilterReader {
         {
             let waiting = (&mut self.order, &mut self.streams);
             decode_datagram(&piece, &bytes, clocks, waiting, observer);
-            self.pieces.reuse(bytes);
+            self.pieces.recycle(bytes);
         }
         let mut newest = 0;
         for _ in 0..PIECES_PER_ROUND {
@@ -209,17 +209,17 @@ impl FilterReader {
                 continue;
             }
             if piece.flags & flag::STREAM != 0 {
-                let chunk = Chunk::of_piece(&piece, bytes, clocks.calendar(piece.time));
+                let chunk = Chunk::of_piece(&piece, bytes, clocks.wall_time_of(piece.time));
                 if piece.chunk & chunk::QUIC != 0 {
                     let seen = (chunk.time, chunk.stream);
                     self.streams
                         .datagram(seen, bytes, chunk.length, |streamed| {
-                            streamed.pass(observer);
+                            streamed.pass_to(observer);
                         });
                     continue;
                 }
                 self.order.segment(piece.time, &chunk);
-                while let Some(oldest) = self.order.excess_segment() {
+                while let Some(oldest) = self.order.take_excess_segment() {
                     read_segment(&mut self.streams, &oldest, observer);
                 }
                 continue;
@@ -232,7 +232,7 @@ impl FilterReader {
                 let waiting = (&mut self.order, &mut self.streams);
                 decode_datagram(&piece, &bytes, clocks, waiting, observer);
                 if let Cow::Owned(bytes) = bytes {
-                    self.pieces.reuse(bytes);
+                    self.pieces.recycle(bytes);
                 }
                 continue;
             }
@@ -281,7 +281,7 @@ fn link_report(piece: &Piece, bytes: &[u8]) -> Option<LinkReport> {
 
 /// Reads a segment of Zenoh, and passes the messages that it completes to the model.
 fn read_segment(streams: &mut Streams, segment: &Segment, observer: &mut Observer) {
-    streams.chunk(&segment.chunk(), |streamed| streamed.pass(observer));
+    streams.chunk(&segment.chunk(), |streamed| streamed.pass_to(observer));
 }
 
 fn decode_datagram(
@@ -294,7 +294,7 @@ fn decode_datagram(
     let waiting = (&mut *order, streams);
     deliver(waiting, clocks, piece.time, observer, usize::MAX);
     let envelope = Envelope {
-        time: clocks.calendar(piece.time).0,
+        time: clocks.wall_time_of(piece.time).0,
         destination: zerocopy::transmute!(piece.destination),
         destination_port: piece.destination_port,
         interface: piece.interface,

@@ -55,7 +55,7 @@ impl FrameDecoder {
         self.last = self.last.max(captured.time);
         observer.input(Input::Time(self.last));
         self.streams
-            .advance(self.last, |streamed| streamed.pass(observer));
+            .advance(self.last, |streamed| streamed.pass_to(observer));
         let parsed = match frame::parse(captured.link, captured.bytes, captured.length) {
             Ok(parsed) => parsed,
             Err(error) => {
@@ -86,7 +86,7 @@ impl FrameDecoder {
                 let is_quic =
                     self.streams
                         .datagram((captured.time, stream), bytes, length, |streamed| {
-                            streamed.pass(observer);
+                            streamed.pass_to(observer);
                         });
                 if is_quic {
                     return;
@@ -96,7 +96,7 @@ impl FrameDecoder {
                     destination_port: datagram.destination_port,
                     ..envelope
                 };
-                give(observer, &envelope, datagram.payload, datagram.length);
+                pass_datagram(observer, &envelope, datagram.payload, datagram.length);
             }
             Payload::Fragment(fragment) => {
                 let key = FlowKey::new(0, interface, outgoing, &packet, &fragment);
@@ -108,7 +108,7 @@ impl FrameDecoder {
                         fragmented: true,
                         ..envelope
                     };
-                    give(observer, &envelope, whole.payload(), whole.length);
+                    pass_datagram(observer, &envelope, whole.payload(), whole.length);
                 }
             }
             Payload::Segment(segment) => {
@@ -118,7 +118,7 @@ impl FrameDecoder {
                 };
                 let chunk = Chunk::of_segment(&segment, captured.time, stream);
                 self.streams
-                    .chunk(&chunk, |streamed| streamed.pass(observer));
+                    .chunk(&chunk, |streamed| streamed.pass_to(observer));
             }
             Payload::Other(_) => {}
         }
@@ -143,7 +143,7 @@ impl FrameDecoder {
     }
 }
 
-fn give(observer: &mut Observer, envelope: &Envelope, payload: &[u8], length: u32) {
+fn pass_datagram(observer: &mut Observer, envelope: &Envelope, payload: &[u8], length: u32) {
     if payload.len() < usize::try_from(length).unwrap_or(usize::MAX) {
         observer.input(Input::CutDatagram {
             envelope,

@@ -136,8 +136,8 @@ impl HostTap {
 
     /// Returns the number of attachments to another control group since the start.
     #[must_use]
-    pub fn attached_anew(&self) -> u64 {
-        self.reattach.as_ref().map_or(0, Reattach::attached_anew)
+    pub fn reattachments(&self) -> u64 {
+        self.reattach.as_ref().map_or(0, Reattach::reattachments)
     }
 
     /// Returns the observed control group.

@@ -16,10 +16,10 @@ use ros2probe_model::facts::bounded::Bounded;
 use ros2probe_wire::{Cursor, Endianness, WireError};
 
 /// Maximum size of a kernel message about one interface, in bytes.
-const BUFFER: usize = 64 << 10;
+const MAX_MESSAGE_BYTES: usize = 64 << 10;
 const IFLA_IFNAME: u16 = 3;
 /// Maximum number of attempts to read a list that changes while the kernel writes it.
-const MOST_ATTEMPTS: u32 = 5;
+const MAX_ATTEMPTS: u32 = 5;
 
 /// One interface.
 #[derive(Clone, PartialEq, Eq, Debug)]
@@ -64,7 +64,7 @@ pub enum InterfacesError {
     Unreadable(#[from] WireError),
     /// The list changed during every attempt.
     #[error("cannot list the network interfaces: they change faster than they can be listed")]
-    Restless,
+    Unstable,
 }
 
 type Known = Bounded<KnownInterfaces, BTreeMap<u32, Interface>>;
@@ -98,7 +98,7 @@ impl Interfaces {
             socket,
             known: Known::default(),
             sequence: 0,
-            buffer: vec![0; BUFFER],
+            buffer: vec![0; MAX_MESSAGE_BYTES],
         };
         interfaces.list()?;
         Ok(interfaces)
@@ -154,10 +154,10 @@ impl Interfaces {
     /// Requests all interfaces and compares them with the known ones.
     fn list(&mut self) -> Result<Vec<Change>, InterfacesError> {
         let mut changes = Vec::new();
-        'attempt: for _ in 0..MOST_ATTEMPTS {
+        'attempt: for _ in 0..MAX_ATTEMPTS {
             // Waiting messages are older than the list, and messages after them may be lost.
             self.drain(&mut changes)?;
-            self.ask()?;
+            self.request()?;
             let mut listed = BTreeSet::new();
             let mut interrupted = false;
             loop {
@@ -212,10 +212,10 @@ impl Interfaces {
                 }
             }
         }
-        Err(InterfacesError::Restless)
+        Err(InterfacesError::Unstable)
     }
 
-    fn ask(&mut self) -> Result<(), InterfacesError> {
+    fn request(&mut self) -> Result<(), InterfacesError> {
         self.sequence = self.sequence.wrapping_add(1);
         let mut request = Vec::with_capacity(32);
         request.extend_from_slice(&32_u32.to_ne_bytes());
@@ -316,12 +316,12 @@ fn apply(known: &mut Known, message: Message) -> Option<Change> {
 
 /// Parses the messages of one datagram.
 fn read(bytes: &[u8], mut sink: impl FnMut(Message)) -> Result<(), WireError> {
-    const NATIVE: Endianness = if cfg!(target_endian = "big") {
+    const NATIVE_ENDIANNESS: Endianness = if cfg!(target_endian = "big") {
         Endianness::Big
     } else {
         Endianness::Little
     };
-    let mut cursor = Cursor::new(bytes, NATIVE);
+    let mut cursor = Cursor::new(bytes, NATIVE_ENDIANNESS);
     while cursor.remaining() > 0 {
         let length = cursor.u32("netlink length")?;
         let body = usize::try_from(length)

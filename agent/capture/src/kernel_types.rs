@@ -8,10 +8,10 @@
 use std::io;
 
 /// File with the kernel's types.
-const PATH: &str = "/sys/kernel/btf/vmlinux";
-const MAGIC: u32 = 0xeb9f;
+const BTF_PATH: &str = "/sys/kernel/btf/vmlinux";
+const BTF_MAGIC: u32 = 0xeb9f;
 /// Maximum nesting depth of anonymous structures and unions that a search enters.
-const DEPTH: u32 = 8;
+const MAX_DEPTH: u32 = 8;
 
 /// Kinds of types.
 mod kind {
@@ -31,10 +31,10 @@ mod kind {
 #[derive(Debug, thiserror::Error)]
 pub enum KernelTypesError {
     /// A kernel without CONFIG_DEBUG_INFO_BTF has no such file.
-    #[error("cannot read the kernel's types from {PATH} (needs CONFIG_DEBUG_INFO_BTF)")]
+    #[error("cannot read the kernel's types from {BTF_PATH} (needs CONFIG_DEBUG_INFO_BTF)")]
     Unreadable(#[source] io::Error),
     /// The file is malformed.
-    #[error("cannot parse the kernel's types ({PATH}) at byte {0}")]
+    #[error("cannot parse the kernel's types ({BTF_PATH}) at byte {0}")]
     Malformed(usize),
 }
 
@@ -95,7 +95,7 @@ impl KernelTypes {
     /// # Errors
     /// Fails if the kernel provides no types, or if the file is malformed.
     pub fn read() -> Result<Self, KernelTypesError> {
-        Self::parse(std::fs::read(PATH).map_err(KernelTypesError::Unreadable)?)
+        Self::parse(std::fs::read(BTF_PATH).map_err(KernelTypesError::Unreadable)?)
     }
 
     /// Parses the bytes of a BTF file.
@@ -105,7 +105,7 @@ impl KernelTypes {
     pub fn parse(bytes: Vec<u8>) -> Result<Self, KernelTypesError> {
         let malformed = KernelTypesError::Malformed;
         let header = |index: usize| word(&bytes, 4 * index).ok_or(malformed(4 * index));
-        if header(0)? & 0xffff != MAGIC {
+        if header(0)? & 0xffff != BTF_MAGIC {
             return Err(malformed(0));
         }
         let header_len = header(1)? as usize;
@@ -141,7 +141,7 @@ impl KernelTypes {
                 let (mut head, mut bits) = (head, 0);
                 let mut parts = member.split('.').peekable();
                 while let Some(part) = parts.next() {
-                    let (offset, of_type) = self.member(head, part, DEPTH)?;
+                    let (offset, of_type) = self.member(head, part, MAX_DEPTH)?;
                     bits += offset;
                     if parts.peek().is_some() {
                         head = self.by_id(of_type)?;
@@ -292,7 +292,7 @@ mod tests {
         .concat();
         let len = u32::try_from(4 * words.len()).unwrap();
         let strings = u32::try_from(NAMES.len()).unwrap();
-        let header = [MAGIC | 1 << 16, 24, 0, len, len, strings];
+        let header = [BTF_MAGIC | 1 << 16, 24, 0, len, len, strings];
         let words = header.iter().chain(&words);
         let mut bytes: Vec<u8> = words.flat_map(|word| word.to_ne_bytes()).collect();
         bytes.extend_from_slice(NAMES.as_bytes());

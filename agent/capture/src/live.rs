@@ -48,14 +48,14 @@ use ros2probe_model::observe::observer::{Observer, Wanted};
 
 /// Time for which captures of the host hook accumulate: a starting node announces its endpoints one
 /// by one, and each round costs CPU time.
-const GATHER: Duration = Duration::from_millis(10);
+const READ_INTERVAL: Duration = Duration::from_millis(10);
 /// Shorter time while whole samples are captured: a point cloud fills the ring in a few
 /// milliseconds.
-const GATHER_PAYLOADS: Duration = Duration::from_millis(2);
-const TENTH: u64 = SECOND / 10;
+const PAYLOAD_READ_INTERVAL: Duration = Duration::from_millis(2);
+const REFILL_INTERVAL: u64 = SECOND / 10;
 /// Time between two rounds that indicates a delay of this process; longer than any wait for
 /// packets.
-const HELD_UP: u64 = 2 * SECOND;
+const MAX_ROUND_GAP: u64 = 2 * SECOND;
 
 /// Why capturing cannot start or continue.
 #[derive(Debug, thiserror::Error)]
@@ -90,7 +90,7 @@ impl CaptureError {
     /// Returns whether interfaces cannot be observed because a right is missing. A restart does not
     /// help then.
     #[must_use]
-    pub const fn is_for_lack_of_rights(&self) -> bool {
+    pub const fn is_permission_error(&self) -> bool {
         matches!(
             self,
             Self::Neither { .. } | Self::Tap(WireTapError::Interfaces(InterfacesError::Family(_)))
@@ -115,13 +115,13 @@ pub struct LiveSource {
     bytes_refilled: u64,
     records_refilled: u64,
     /// Time when the model's requests for shared memory were last passed on.
-    wanted_asked: u64,
+    last_requests_passed: u64,
     /// Whether the last round did not pass the requests on, so that a change may wait.
-    wanted_waits: bool,
+    has_pending_requests: bool,
     /// Time when the participants' last messages were last read from the programs, for a lease.
-    heard: u64,
+    last_liveliness_read: u64,
     /// Number of attachments to a recreated control group at the last report.
-    attached_anew: u64,
+    reported_reattachments: u64,
     refused_updates: u64,
     clock: Timestamp,
     clocks: Clocks,
@@ -268,10 +268,10 @@ impl LiveSource {
             without_inside,
             bytes_refilled: 0,
             records_refilled: 0,
-            wanted_asked: 0,
-            wanted_waits: false,
-            heard: 0,
-            attached_anew: 0,
+            last_requests_passed: 0,
+            has_pending_requests: false,
+            last_liveliness_read: 0,
+            reported_reattachments: 0,
             refused_updates: 0,
             clock: clocks.now,
             clocks,
@@ -313,15 +313,17 @@ impl LiveSource {
     }
 
     /// Sets whether a client needs calls inside processes, if they are observed on demand.
-    pub fn want_inside(&self, wanted: bool) {
-        self.inside.iter().for_each(|inside| inside.want(wanted));
+    pub fn request_inside(&self, wanted: bool) {
+        self.inside
+            .iter()
+            .for_each(|inside| inside.set_calls_requested(wanted));
     }
 
     /// Sets which calls clients regard as late, and whether one requests their causes.
-    pub fn want_late(&self, demand: &LateDemand) {
+    pub fn request_late_calls(&self, demand: &LateDemand) {
         self.inside
             .iter()
-            .for_each(|inside| inside.want_late(demand));
+            .for_each(|inside| inside.set_late_demand(demand));
     }
 
     /// Returns why processes are not observed from inside although that is configured.
@@ -375,8 +377,8 @@ impl LiveSource {
         let taps = sockets.chain(processes).chain(interfaces).chain(looks);
         let descriptors: Vec<_> = bell.into_iter().chain(taps).collect();
         let began = Instant::now();
-        let timeout = match self.wanted_waits {
-            true => timeout.min(Duration::from_nanos(TENTH)),
+        let timeout = match self.has_pending_requests {
+            true => timeout.min(Duration::from_nanos(REFILL_INTERVAL)),
             false => timeout,
         };
         let ready = wait(&descriptors, timeout).map_err(CaptureError::Wait)?;
@@ -384,10 +386,10 @@ impl LiveSource {
         if (self.host.is_some() || self.exact.is_some()) && woken {
             // Packets arrive in bursts. After a timeout, packets have already had time to
             // accumulate.
-            std::thread::sleep(if observer.wants_payloads() {
-                GATHER_PAYLOADS
+            std::thread::sleep(if observer.needs_payloads() {
+                PAYLOAD_READ_INTERVAL
             } else {
-                GATHER
+                READ_INTERVAL
             });
         }
         let mut clocks = Clocks::read();
@@ -400,7 +402,7 @@ impl LiveSource {
             );
             observer.input(Input::ClockSet(step));
         }
-        let held_up = clocks.monotonic.saturating_sub(self.clocks.monotonic) >= HELD_UP;
+        let held_up = clocks.monotonic.saturating_sub(self.clocks.monotonic) >= MAX_ROUND_GAP;
         self.clocks = clocks;
         self.refill(clocks.monotonic);
         let mut settle = 0;
@@ -435,9 +437,9 @@ impl LiveSource {
         // announcements may not have fit.
         let clock = self.clock;
         let ends = observer.next_expiry().is_some_and(|end| end <= clock);
-        let is_due = clocks.monotonic.wrapping_sub(self.heard) >= TENTH;
+        let is_due = clocks.monotonic.wrapping_sub(self.last_liveliness_read) >= REFILL_INTERVAL;
         if held_up || ends && is_due {
-            self.heard = clocks.monotonic;
+            self.last_liveliness_read = clocks.monotonic;
             for (prefix, at) in self.last_seen() {
                 observer.input(Input::ParticipantAlive(prefix, at));
             }
@@ -448,8 +450,9 @@ impl LiveSource {
     /// Reports that observation begins again after a gap: this process or the machine was stopped,
     /// or the control group was removed.
     fn report_view(&mut self, held_up: bool, observer: &mut Observer) {
-        let attached_anew = self.attached_anew();
-        let is_new = std::mem::replace(&mut self.attached_anew, attached_anew) != attached_anew;
+        let attached_anew = self.reattachments();
+        let is_new =
+            std::mem::replace(&mut self.reported_reattachments, attached_anew) != attached_anew;
         let sees_nothing = self.wires.is_empty()
             && self
                 .host
@@ -462,28 +465,28 @@ impl LiveSource {
 
     /// Passes the model's requests for shared memory to its readers, ten times a second.
     fn apply_wanted(&mut self, now: u64, observer: &Observer) {
-        self.wanted_waits = now.wrapping_sub(self.wanted_asked) < TENTH;
-        if self.wanted_waits {
+        self.has_pending_requests = now.wrapping_sub(self.last_requests_passed) < REFILL_INTERVAL;
+        if self.has_pending_requests {
             return;
         }
-        self.wanted_asked = now;
-        self.want(observer);
+        self.last_requests_passed = now;
+        self.apply_requests(observer);
     }
 
-    fn want(&self, observer: &Observer) {
+    fn apply_requests(&self, observer: &Observer) {
         let wanted = observer.wanted_of_shared_memory();
         if let Shm::Running(shared_memory) = &self.shared_memory {
-            shared_memory.want(wanted);
+            shared_memory.set_need(wanted);
         }
         if let Some(exact) = &self.exact {
-            exact.want(wanted == Wanted::EverySample);
+            exact.set_demand(wanted == Wanted::EverySample);
         }
     }
 
     /// Passes the model's requests for shared memory to its readers immediately. Returns whether
     /// the programs that read every sample are still being attached.
     pub fn is_attaching(&self, observer: &Observer) -> bool {
-        self.want(observer);
+        self.apply_requests(observer);
         self.exact.as_ref().is_some_and(Uprobe::is_attaching)
     }
 
@@ -546,7 +549,7 @@ impl LiveSource {
     pub fn last_seen(&self) -> BTreeMap<GuidPrefix, Timestamp> {
         let mut seen = BTreeMap::new();
         for (participant, at) in self.filters().flat_map(Filter::participants) {
-            let at = self.clocks.calendar(at);
+            let at = self.clocks.wall_time_of(at);
             let latest = seen.entry(participant).or_insert(at);
             *latest = at.max(*latest);
         }
@@ -674,9 +677,9 @@ impl LiveSource {
     /// Returns a sentence about an observed object that no longer exists and yields no data; `None`
     /// if all exist.
     #[must_use]
-    pub fn gone(&self) -> Option<String> {
+    pub fn missing_object(&self) -> Option<String> {
         let cgroup = self.host.as_ref().and_then(HostTap::detached);
-        cgroup.or_else(|| self.wires.iter().find_map(WireTap::gone))
+        cgroup.or_else(|| self.wires.iter().find_map(WireTap::missing_object))
     }
 
     /// Returns a sentence about what is not observed yet after the start; `None` if everything is
@@ -715,14 +718,14 @@ impl LiveSource {
 
     /// Returns the number of attachments of the host hook to a recreated control group.
     #[must_use]
-    pub fn attached_anew(&self) -> u64 {
-        self.host.as_ref().map_or(0, HostTap::attached_anew)
+    pub fn reattachments(&self) -> u64 {
+        self.host.as_ref().map_or(0, HostTap::reattachments)
     }
 
     /// Switches to sampling of shared memory: the programs identify their control group by a
     /// number, and a recreated group has another one.
     fn leave_exact_mode(&mut self, clocks: &Clocks, observer: &mut Observer) {
-        if self.attached_anew() > 0
+        if self.reattachments() > 0
             && let Some(mut exact) = self.exact.take()
         {
             exact.drain(clocks, observer);
@@ -773,12 +776,12 @@ impl LiveSource {
     }
 
     fn refill(&mut self, monotonic: u64) {
-        if monotonic.wrapping_sub(self.bytes_refilled) >= SECOND - TENTH {
+        if monotonic.wrapping_sub(self.bytes_refilled) >= SECOND - REFILL_INTERVAL {
             self.bytes_refilled = monotonic;
             let (budget, amount) = (Budget::CaptureBytes, UNKNOWN_BYTES_PER_SECOND);
             self.each_filter(|filter| filter.set_unknown_budget(budget, amount));
         }
-        let tenths = monotonic.wrapping_sub(self.records_refilled) / TENTH;
+        let tenths = monotonic.wrapping_sub(self.records_refilled) / REFILL_INTERVAL;
         if tenths > 0 {
             self.records_refilled = monotonic;
             let tenths = u32::try_from(tenths).unwrap_or(UNKNOWN_PORTIONS);

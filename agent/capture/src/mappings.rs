@@ -17,16 +17,16 @@ use ros2probe_attach::client::{Broker, BrokerError};
 use crate::error_chain::Reason;
 
 /// Pause after mappings of other files. It bounds the cost on a machine that starts many programs.
-pub const UNCONCERNED: Duration = Duration::from_millis(2);
+pub const UNRELATED_DELAY: Duration = Duration::from_millis(2);
 
 /// Pages of records in each ring, a power of two: some 250 mappings, about two starts of a node.
-const PAGES: usize = 8;
+const RING_PAGES: usize = 8;
 /// Offsets in the ring's first page, `struct perf_event_mmap_page`.
-const HEAD: usize = 1024;
-const TAIL: usize = 1032;
+const HEAD_OFFSET: usize = 1024;
+const TAIL_OFFSET: usize = 1032;
 /// Types of records.
-const MAPPED: u32 = 1;
-const LOST: u32 = 2;
+const MAPPING_RECORD: u32 = 1;
+const LOST_RECORD: u32 = 2;
 /// Bytes of a record before the name of the mapped file: the header, two ids, three numbers.
 const BEFORE_NAME: usize = 40;
 /// Maximum size of a record, in bytes: its length field has 16 bits.
@@ -105,8 +105,8 @@ impl MappingEvents {
         let mut new = NewMappings::default();
         for ring in &self.rings {
             ring.take(&mut self.record, |kind, record| match kind {
-                MAPPED => new.processes.extend(process(record, &is_library)),
-                LOST => new.is_incomplete = true,
+                MAPPING_RECORD => new.processes.extend(process(record, &is_library)),
+                LOST_RECORD => new.is_incomplete = true,
                 _ => {}
             });
         }
@@ -135,7 +135,7 @@ impl Ring {
         let start = unsafe {
             libc::mmap(
                 ptr::null_mut(),
-                page * (1 + PAGES),
+                page * (1 + RING_PAGES),
                 libc::PROT_READ | libc::PROT_WRITE,
                 libc::MAP_SHARED,
                 event.as_raw_fd(),
@@ -150,15 +150,15 @@ impl Ring {
             event,
             start,
             page,
-            size: page * PAGES,
+            size: page * RING_PAGES,
         })
     }
 
     /// Passes the type and the bytes of each new record to `with`, and frees the space of the
     /// record.
     fn take(&self, record: &mut Vec<u8>, mut with: impl FnMut(u32, &[u8])) {
-        let head = self.position(HEAD).load(Ordering::Acquire);
-        let mut tail = self.position(TAIL).load(Ordering::Relaxed);
+        let head = self.position(HEAD_OFFSET).load(Ordering::Acquire);
+        let mut tail = self.position(TAIL_OFFSET).load(Ordering::Relaxed);
         while tail < head {
             let mut header = [0; 8];
             self.copy(tail, &mut header);
@@ -170,7 +170,7 @@ impl Ring {
             // A record of length 0 would cause an endless loop.
             tail += u64::from(length).max(8);
         }
-        self.position(TAIL).store(tail, Ordering::Release);
+        self.position(TAIL_OFFSET).store(tail, Ordering::Release);
     }
 
     /// Copies bytes that the kernel has written and that have not been freed yet.

@@ -17,7 +17,7 @@ use zerocopy::FromBytes;
 use crate::bpf;
 
 /// Maximum size of the output of one run, in bytes: some 20,000 sockets.
-const LIMIT: u64 = 1 << 20;
+const MAX_OUTPUT: u64 = 1 << 20;
 /// `BPF_TRACE_ITER` of `linux/bpf.h`.
 const TRACE_ITER: u32 = 28;
 
@@ -86,7 +86,7 @@ impl Owners {
         let run = bpf::create_iterator(link).map_err(OwnersError::Run)?;
         let mut bytes = Vec::new();
         File::from(run)
-            .take(LIMIT)
+            .take(MAX_OUTPUT)
             .read_to_end(&mut bytes)
             .map_err(OwnersError::Run)?;
         Ok(read(&bytes, sockets))

@@ -16,16 +16,16 @@ use crate::tables::{FreshDatagrams, OpenPieces};
 /// loses its CPU.
 const LIFETIME_NANOSECONDS: u64 = 1_000_000_000;
 /// Time without a datagram in several pieces after which buffers are freed.
-const KEPT_NANOSECONDS: u64 = 10_000_000_000;
+const PIECE_LIFETIME_NANOSECONDS: u64 = 10_000_000_000;
 
 /// Incomplete datagrams, the oldest first: datagrams that several CPUs write at the same time, and
 /// datagrams with lost pieces.
 #[derive(Debug, Default)]
 pub struct PieceAssembler {
     open: Bounded<OpenPieces, VecDeque<Open>>,
-    given_up: u64,
+    discarded: u64,
     /// Empty buffers for reuse. In a new buffer, the kernel would have to clear each page.
-    spare: Vec<Vec<u8>>,
+    free_buffers: Vec<Vec<u8>>,
     /// Time of the latest datagram in several pieces, in the kernel's clock.
     used: u64,
 }
@@ -52,15 +52,15 @@ impl PieceAssembler {
             .position(|open| open.first.datagram == piece.datagram);
         if piece.offset == 0 {
             // The token is reused, so the remaining pieces of the other datagram are lost.
-            self.give_up(open);
+            self.discard(open);
             if !fits {
-                self.given_up += 1;
+                self.discarded += 1;
                 return None;
             }
             if piece.len == piece.datagram_len {
                 return Some((*piece, Cow::Borrowed(bytes)));
             }
-            let mut buffer = self.spare.pop().unwrap_or_default();
+            let mut buffer = self.free_buffers.pop().unwrap_or_default();
             buffer.reserve_exact(piece.datagram_len as usize);
             buffer.extend_from_slice(bytes);
             self.used = piece.time;
@@ -68,14 +68,14 @@ impl PieceAssembler {
                 first: *piece,
                 bytes: buffer,
             });
-            self.given_up += u64::from(oldest.is_some());
+            self.discarded += u64::from(oldest.is_some());
             return None;
         }
         // The first piece was discarded or never arrived.
         let index = open?;
         let open = self.open.get_mut(index)?;
         if !fits || !open.is_followed_by(piece) {
-            self.give_up(Some(index));
+            self.discard(Some(index));
             return None;
         }
         open.bytes.extend_from_slice(bytes);
@@ -87,40 +87,41 @@ impl PieceAssembler {
     }
 
     /// Keeps the buffer of a datagram that was read, for reuse.
-    pub fn reuse(&mut self, mut buffer: Vec<u8>) {
-        if buffer.capacity() > PIECE_BYTES as usize && self.spare.len() < FreshDatagrams::CAP {
+    pub fn recycle(&mut self, mut buffer: Vec<u8>) {
+        if buffer.capacity() > PIECE_BYTES as usize && self.free_buffers.len() < FreshDatagrams::CAP
+        {
             buffer.clear();
-            self.spare.push(buffer);
+            self.free_buffers.push(buffer);
         }
     }
 
     /// Discards datagrams that have waited too long, in the kernel's clock.
     pub fn advance(&mut self, now: u64) {
-        if now.saturating_sub(self.used) > KEPT_NANOSECONDS {
-            self.spare = Vec::new();
+        if now.saturating_sub(self.used) > PIECE_LIFETIME_NANOSECONDS {
+            self.free_buffers = Vec::new();
         }
         let before = self.open.len();
         self.open
             .retain(|open| now.saturating_sub(open.first.time) < LIFETIME_NANOSECONDS);
-        self.given_up += (before - self.open.len()) as u64;
+        self.discarded += (before - self.open.len()) as u64;
     }
 
     /// Returns the number of datagrams that never became complete.
     #[must_use]
-    pub const fn given_up(&self) -> u64 {
-        self.given_up
+    pub const fn discarded(&self) -> u64 {
+        self.discarded
     }
 
     /// Returns the bytes of incomplete datagrams, and of buffers for reuse.
     #[must_use]
     pub fn bytes(&self) -> usize {
         let open: usize = self.open.iter().map(|open| open.bytes.len()).sum();
-        open + self.spare.iter().map(Vec::capacity).sum::<usize>()
+        open + self.free_buffers.iter().map(Vec::capacity).sum::<usize>()
     }
 
-    fn give_up(&mut self, index: Option<usize>) {
+    fn discard(&mut self, index: Option<usize>) {
         if index.and_then(|index| self.open.remove(index)).is_some() {
-            self.given_up += 1;
+            self.discarded += 1;
         }
     }
 }
@@ -194,7 +195,7 @@ mod tests {
             }
         }
         assert_eq!(complete, [1, 2]);
-        assert_eq!((wholes.bytes(), wholes.given_up()), (0, 0));
+        assert_eq!((wholes.bytes(), wholes.discarded()), (0, 0));
     }
 
     #[test]
@@ -204,15 +205,15 @@ mod tests {
         assert!(wholes.piece(&all[0].0, &all[0].1).is_none());
         // The second piece is lost.
         assert!(wholes.piece(&all[2].0, &all[2].1).is_none());
-        assert_eq!((wholes.bytes(), wholes.given_up()), (0, 1));
+        assert_eq!((wholes.bytes(), wholes.discarded()), (0, 1));
         assert!(wholes.piece(&all[0].0, &all[0].1).is_none());
         wholes.advance(LIFETIME_NANOSECONDS);
-        assert_eq!(wholes.given_up(), 1);
+        assert_eq!(wholes.discarded(), 1);
         wholes.advance(LIFETIME_NANOSECONDS + 1);
-        assert_eq!((wholes.bytes(), wholes.given_up()), (0, 2));
+        assert_eq!((wholes.bytes(), wholes.discarded()), (0, 2));
         // A piece that arrives later is ignored.
         assert!(wholes.piece(&all[1].0, &all[1].1).is_none());
-        assert_eq!(wholes.given_up(), 2);
+        assert_eq!(wholes.discarded(), 2);
     }
 
     #[test]
@@ -223,7 +224,7 @@ mod tests {
         assert!(wholes.piece(&new[0].0, &new[0].1).is_none());
         let (_, whole) = wholes.piece(&new[1].0, &new[1].1).unwrap();
         assert_eq!(whole, content(1, 0, 20_000));
-        assert_eq!(wholes.given_up(), 1);
+        assert_eq!(wholes.discarded(), 1);
     }
 
     #[test]
@@ -234,7 +235,7 @@ mod tests {
             assert!(wholes.piece(&all[0].0, &all[0].1).is_none());
         }
         assert_driven::<OpenPieces>();
-        assert_eq!(wholes.given_up(), 1000 - wholes.open.len() as u64);
+        assert_eq!(wholes.discarded(), 1000 - wholes.open.len() as u64);
     }
 
     proptest! {

@@ -18,7 +18,7 @@ use ros2probe_wire::frame::{Fragment, Packet};
 use ros2probe_wire::record::{Record, flag};
 use ros2probe_wire::{Cursor, Endianness, Timestamp};
 
-use flow::{Flow, Placed};
+use flow::{Flow, Placement};
 
 use crate::tables::{FinishedFlows, FlowBytes, Flows};
 
@@ -34,10 +34,10 @@ pub struct Limits {
     /// Nanoseconds for which an unfinished datagram is kept. Linux: `ipfrag_time`, 30 s.
     pub timeout: u64,
     /// Maximum number of finished datagrams that are remembered.
-    pub remembered: usize,
+    pub max_finished: usize,
     /// Nanoseconds for which a finished datagram is remembered. Duplicates arrive within
     /// milliseconds, while a busy sender reuses an IPv4 identification after seconds.
-    pub remember: u64,
+    pub finished_lifetime: u64,
 }
 
 impl Default for Limits {
@@ -46,8 +46,8 @@ impl Default for Limits {
             bytes: 4 << 20,
             flows: Flows::CAP,
             timeout: 30_000_000_000,
-            remembered: FinishedFlows::CAP,
-            remember: 1_000_000_000,
+            max_finished: FinishedFlows::CAP,
+            finished_lifetime: 1_000_000_000,
         }
     }
 }
@@ -96,7 +96,7 @@ pub struct Reassembled {
 impl Reassembled {
     /// Returns the bytes held.
     #[must_use]
-    pub fn held(&self) -> usize {
+    pub fn held_bytes(&self) -> usize {
         // A new field does not compile until this pattern names it.
         let Self {
             transport,
@@ -202,7 +202,7 @@ impl Reassembly {
             opened: 0,
             bytes: Sum::capped(limits.bytes),
             finished: HashSet::new(),
-            finished_order: Bounded::capped(limits.remembered),
+            finished_order: Bounded::capped(limits.max_finished),
             counters: Counters::default(),
         }
     }
@@ -227,9 +227,9 @@ impl Reassembly {
         self.bytes.sub(before);
         self.bytes.add(after);
         match placed {
-            Placed::New => {}
-            Placed::Nothing => self.counters.duplicate += 1,
-            Placed::Contradiction => {
+            Placement::New => {}
+            Placement::Duplicate => self.counters.duplicate += 1,
+            Placement::Contradiction => {
                 self.counters.contradictory += 1;
                 // The identification is reused, and the remaining fragments of the old datagram are
                 // lost. A handed-over datagram stays, because the kernel filter has just seen it.
@@ -281,7 +281,7 @@ impl Reassembly {
             self.close(&key);
             self.counters.timed_out += 1;
         }
-        let remember = self.limits.remember;
+        let remember = self.limits.finished_lifetime;
         let is_old = |(at, _): &mut (Timestamp, _)| now.0.saturating_sub(at.0) > remember;
         while let Some((_, key)) = self.finished_order.pop_front_if(is_old) {
             self.finished.remove(&key);

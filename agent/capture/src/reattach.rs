@@ -22,10 +22,10 @@ use super::system::{DirectoryWatch, wait};
 use crate::threads::{Progress, Spawn, Task};
 
 /// Interval of checks while the directory above the group is not watched.
-const EVERY: Duration = Duration::from_secs(1);
+const POLL_INTERVAL: Duration = Duration::from_secs(1);
 /// Interval of checks while it is watched: inotify reports a group that appears there or is
 /// removed. Only the removal or the mount of a directory further up waits for a check.
-const EVERY_WATCHED: Duration = Duration::from_secs(10);
+const WATCHED_POLL_INTERVAL: Duration = Duration::from_secs(10);
 
 /// Device and inode of a directory, unique per control group.
 pub type Identity = (u64, u64);
@@ -43,7 +43,7 @@ struct Shared {
     /// Why the hook is not attached.
     detached: Mutex<Option<String>>,
     /// Number of times that the hook was attached again.
-    attached_anew: AtomicU64,
+    reattachments: AtomicU64,
     progress: Progress,
 }
 
@@ -108,8 +108,8 @@ impl Reattach {
 
     /// Returns the number of attachments to another group since the start.
     #[must_use]
-    pub fn attached_anew(&self) -> u64 {
-        self.shared.attached_anew.load(Ordering::Acquire)
+    pub fn reattachments(&self) -> u64 {
+        self.shared.reattachments.load(Ordering::Acquire)
     }
 }
 
@@ -139,10 +139,10 @@ impl Follow {
             self.check();
             let ended = ended.as_fd();
             let every = match watches_above && self.attached.is_some() {
-                true => EVERY_WATCHED,
-                false => EVERY,
+                true => WATCHED_POLL_INTERVAL,
+                false => POLL_INTERVAL,
             };
-            self.shared.progress.rest();
+            self.shared.progress.set_idle();
             let is_over = match &watch {
                 Some(watch) => wait(&[ended, watch.as_fd()], every),
                 None => wait(&[ended], every),
@@ -173,7 +173,7 @@ impl Follow {
         }
         match self.attach() {
             Ok(()) => {
-                self.shared.attached_anew.fetch_add(1, Ordering::Release);
+                self.shared.reattachments.fetch_add(1, Ordering::Release);
                 *self.detached() = None;
                 tracing::info!(
                     cgroup = %self.path.display(),

@@ -34,7 +34,7 @@ use crate::tables::{
 };
 
 /// Maximum capacity that an empty queue keeps. A larger queue is freed after a burst.
-const KEPT: usize = 512;
+const MAX_KEPT_CAPACITY: usize = 512;
 /// Maximum number of records read per round: several rings of the default size.
 const RECORDS_PER_ROUND: usize = 32_768;
 /// Maximum delay of a captured datagram after the report of its drop.
@@ -56,7 +56,7 @@ pub struct ReorderBuffer {
     undelivered: Bounded<UndeliveredDatagrams, VecDeque<(u64, u32)>>,
     undelivered_tokens: HashSet<u32>,
     /// Time of the latest record of the kernel's ring, in the kernel's clock.
-    recorded: u64,
+    latest_record: u64,
 }
 
 /// A record of a captured datagram.
@@ -115,16 +115,16 @@ impl ReorderBuffer {
     pub fn take_records(&mut self, filter: &mut Filter, copied_bytes: &mut u64) -> u64 {
         for _ in 0..RECORDS_PER_ROUND {
             if self.is_full() {
-                return self.recorded;
+                return self.latest_record;
             }
             let Some(record) = filter.next_record() else {
                 return u64::MAX;
             };
             *copied_bytes += size_of::<Record>() as u64;
-            self.recorded = record.time;
+            self.latest_record = record.time;
             self.kernel(record);
         }
-        self.recorded
+        self.latest_record
     }
 
     /// Accepts a record of the kernel's ring, with its time in the kernel's clock.
@@ -152,7 +152,7 @@ impl ReorderBuffer {
     /// Accepts a record of a captured datagram, with its time in the wall clock. `at` is the same
     /// time in the kernel's clock. Returns the record if too many wait.
     #[must_use]
-    pub fn walked(&mut self, at: u64, record: Record) -> Option<Record> {
+    pub fn add_captured(&mut self, at: u64, record: Record) -> Option<Record> {
         let left = self.walked.push_back(Walked {
             at,
             record,
@@ -164,13 +164,13 @@ impl ReorderBuffer {
     /// Accepts a record of a polled message, with its time in the wall clock. `at` is the same time
     /// in the kernel's clock. Returns the record if too many wait.
     #[must_use]
-    pub fn polled(&mut self, at: u64, record: Record) -> Option<Record> {
+    pub fn add_polled(&mut self, at: u64, record: Record) -> Option<Record> {
         let left = self.polled.push_back((at, record));
         left.map(|(_, record)| record)
     }
 
     /// Accepts a segment of Zenoh, with its time in the wall clock. `at` is the same time in the
-    /// kernel's clock. The caller then reads the segments of [`Self::excess_segment`].
+    /// kernel's clock. The caller then reads the segments of [`Self::take_excess_segment`].
     pub fn segment(&mut self, at: u64, chunk: &Chunk<'_>) {
         let segment = Segment {
             at,
@@ -182,7 +182,7 @@ impl ReorderBuffer {
     }
 
     /// Removes and returns the oldest segment if too many bytes wait.
-    pub fn excess_segment(&mut self) -> Option<Segment> {
+    pub fn take_excess_segment(&mut self) -> Option<Segment> {
         let is_exceeded = self.segment_bytes.is_exceeded();
         is_exceeded.then(|| self.take_segment()).flatten()
     }
@@ -207,7 +207,7 @@ impl ReorderBuffer {
         let captured = Captured::new(envelope, payload, false);
         read(captured, payload, observer, |mut record, observer| {
             complete(&mut record);
-            if let Some(record) = self.walked(at, record) {
+            if let Some(record) = self.add_captured(at, record) {
                 observe(observer, &record);
             }
         });
@@ -224,7 +224,7 @@ impl ReorderBuffer {
         let captured = Captured::new(envelope, payload, true);
         read(captured, payload, observer, |mut record, observer| {
             record.flags |= flag::SHM;
-            if let Some(record) = self.polled(at, record) {
+            if let Some(record) = self.add_polled(at, record) {
                 observe(observer, &record);
             }
         });
@@ -252,11 +252,11 @@ impl ReorderBuffer {
         let oldest = queues.into_iter().flatten().min();
         if oldest.is_none_or(|oldest| oldest > until) {
             self.forget_undelivered(until);
-            self.give_back();
+            self.release_memory();
             return None;
         }
         let of_kernel = |mut record: Record| {
-            record.time = clocks.calendar(record.time).0;
+            record.time = clocks.wall_time_of(record.time).0;
             Next::Kernel(record)
         };
         if socket_full == oldest {
@@ -268,14 +268,14 @@ impl ReorderBuffer {
         if segment == oldest {
             let mut segment = self.take_segment()?;
             if clocks.step != 0 {
-                segment.chunk.time = clocks.calendar(segment.at);
+                segment.chunk.time = clocks.wall_time_of(segment.at);
             }
             return Some(Next::Segment(segment));
         }
         if walked != oldest {
             let (at, mut record) = self.polled.pop_front()?;
             if clocks.step != 0 {
-                record.time = clocks.calendar(at).0;
+                record.time = clocks.wall_time_of(at).0;
             }
             return Some(Next::Polled(record));
         }
@@ -290,25 +290,25 @@ impl ReorderBuffer {
         }
         let mut record = record;
         if clocks.step != 0 {
-            record.time = clocks.calendar(walked.at).0;
+            record.time = clocks.wall_time_of(walked.at).0;
         }
         self.walked.pop_front();
         Some(Next::Walked(record))
     }
 
-    fn give_back(&mut self) {
+    fn release_memory(&mut self) {
         for records in [&mut self.kernel, &mut self.socket_full] {
-            if records.is_empty() && records.capacity() > KEPT {
+            if records.is_empty() && records.capacity() > MAX_KEPT_CAPACITY {
                 *records = VecDeque::new();
             }
         }
-        if self.walked.is_empty() && self.walked.capacity() > KEPT {
+        if self.walked.is_empty() && self.walked.capacity() > MAX_KEPT_CAPACITY {
             self.walked.take();
         }
-        if self.polled.is_empty() && self.polled.capacity() > KEPT {
+        if self.polled.is_empty() && self.polled.capacity() > MAX_KEPT_CAPACITY {
             self.polled.take();
         }
-        if self.segments.is_empty() && self.segments.capacity() > KEPT {
+        if self.segments.is_empty() && self.segments.capacity() > MAX_KEPT_CAPACITY {
             self.segments = VecDeque::new();
         }
     }
@@ -346,7 +346,7 @@ mod tests {
     use ros2probe_wire::record::kind;
 
     use super::*;
-    use crate::streams::Before;
+    use crate::streams::MissingBefore;
     use crate::tables::tests::assert_driven;
     use ros2probe_wire::time::MILLISECOND;
 
@@ -395,7 +395,7 @@ mod tests {
     }
 
     fn walked(order: &mut ReorderBuffer, (at, record): (u64, Record)) {
-        assert!(order.walked(at, record).is_none());
+        assert!(order.add_captured(at, record).is_none());
     }
 
     /// Returns the sequence numbers of due records, negative for records of a full socket buffer.
@@ -492,7 +492,7 @@ mod tests {
         // Samples 199 and 200 are polled in one round; 171 and 198 arrive through the ring.
         for (number, at) in [(170, 1), (199, 40), (200, 44)] {
             let (at, record) = captured(number, at);
-            assert!(order.polled(at, record).is_none());
+            assert!(order.add_polled(at, record).is_none());
         }
         for (number, at) in [(171, 5), (198, 38), (199, 39)] {
             walked(&mut order, captured(number, at));
@@ -506,7 +506,7 @@ mod tests {
         let mut order = ReorderBuffer::default();
         let (_, back) = captured(1, 3_600_000);
         let at = clocks(10).monotonic_of(Timestamp(back.time));
-        assert!(order.walked(at, back).is_none());
+        assert!(order.add_captured(at, back).is_none());
         let next = order.next(&clocks(90), 10 * MILLISECOND);
         assert!(matches!(next, Some(Next::Walked(_))), "{next:?}");
     }
@@ -517,12 +517,12 @@ mod tests {
         for number in 0..20_000 {
             order.kernel(of_the_kernel(number, 1));
             let (at, record) = captured(number, 1);
-            let _ = order.walked(at, record);
+            let _ = order.add_captured(at, record);
         }
         assert!(order.kernel.capacity() >= 20_000);
         while order.next(&clocks(900), 900 * MILLISECOND).is_some() {}
-        assert!(order.kernel.capacity() <= KEPT);
-        assert!(order.walked.capacity() <= KEPT);
+        assert!(order.kernel.capacity() <= MAX_KEPT_CAPACITY);
+        assert!(order.walked.capacity() <= MAX_KEPT_CAPACITY);
     }
 
     fn segment(number: u32, milliseconds: u64, bytes: &[u8]) -> (u64, Chunk<'_>) {
@@ -534,7 +534,7 @@ mod tests {
             syn: false,
             end: false,
             boundary: Some(crate::streams::Protocol::Zenoh),
-            before: Before::Unknown,
+            before: MissingBefore::Unknown,
             bytes,
             length: 4,
         };
@@ -547,7 +547,7 @@ mod tests {
         for (number, milliseconds) in [(1, 10), (2, 30), (3, 110)] {
             let (at, chunk) = segment(number, milliseconds, b"four");
             order.segment(at, &chunk);
-            assert!(order.excess_segment().is_none());
+            assert!(order.take_excess_segment().is_none());
         }
         order.kernel(of_the_kernel(9, 20));
         walked(&mut order, captured(10, 40));
@@ -578,7 +578,7 @@ mod tests {
         for number in 0..1000 {
             let (at, chunk) = segment(number, 1, &bytes);
             order.segment(at, &chunk);
-            while let Some(passed) = order.excess_segment() {
+            while let Some(passed) = order.take_excess_segment() {
                 early.push(passed.chunk().sequence_number);
             }
             assert!(order.segment_bytes.used() <= SegmentBytes::CAP);
@@ -605,7 +605,7 @@ mod tests {
             let bytes = if number < 50_000 { b"four" } else { &large[..] };
             let (at, chunk) = segment(number, 1, bytes);
             order.segment(at, &chunk);
-            while order.excess_segment().is_some() {}
+            while order.take_excess_segment().is_some() {}
             assert!(order.segment_bytes.used() <= SegmentBytes::CAP);
         }
     }
@@ -615,13 +615,13 @@ mod tests {
         let mut order = ReorderBuffer::default();
         let refused = (0..20_000).filter(|number| {
             let (at, record) = captured(*number, 1);
-            order.walked(at, record).is_some()
+            order.add_captured(at, record).is_some()
         });
         assert_eq!(refused.count(), 20_000 - WalkedRecords::CAP);
         assert_driven::<WalkedRecords>();
         let refused = (0..20_000).filter(|number| {
             let (at, record) = captured(*number, 1);
-            order.polled(at, record).is_some()
+            order.add_polled(at, record).is_some()
         });
         assert_eq!(refused.count(), 20_000 - PolledRecords::CAP);
         assert_driven::<PolledRecords>();

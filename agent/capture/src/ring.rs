@@ -20,7 +20,7 @@ use std::time::Duration;
 
 use libc::{c_int, socklen_t};
 
-use turns::Turns;
+use turns::BlockReader;
 
 use super::container::add;
 
@@ -32,9 +32,9 @@ const NOMINAL_FRAME: usize = 2048;
 /// Size of a block, in bytes. The largest frame, a 64 KiB datagram on loopback, fits with its
 /// header and the block's. The kernel releases a block when it is full or [`Settings::retire`] old,
 /// so the number of blocks limits the delay of the reader. Many small blocks are therefore better.
-const BLOCK: usize = 128 << 10;
+const BLOCK_BYTES: usize = 128 << 10;
 /// Default size of a ring, in bytes.
-const MEMORY: usize = 4 << 20;
+const DEFAULT_RING_BYTES: usize = 4 << 20;
 /// Pause between polls of a socket that repeatedly reports an error.
 const ERROR_PAUSE: Duration = Duration::from_millis(10);
 
@@ -51,7 +51,7 @@ pub struct Settings {
 
 impl Default for Settings {
     fn default() -> Self {
-        Self::with_memory(MEMORY)
+        Self::with_memory(DEFAULT_RING_BYTES)
     }
 }
 
@@ -61,8 +61,8 @@ impl Settings {
     #[must_use]
     pub fn with_memory(bytes: usize) -> Self {
         Self {
-            block_size: BLOCK,
-            blocks: (bytes / BLOCK).max(2),
+            block_size: BLOCK_BYTES,
+            blocks: (bytes / BLOCK_BYTES).max(2),
             retire: Duration::from_millis(100),
         }
     }
@@ -117,7 +117,7 @@ pub enum RingError {
 #[derive(Debug)]
 pub struct Ring {
     // Fields are dropped in this order: the memory is released before the socket is closed.
-    turns: Turns,
+    turns: BlockReader,
     _memory: Mapping,
     socket: OwnedFd,
     statistics: Statistics,
@@ -176,7 +176,7 @@ impl Ring {
         // SAFETY: the mapping holds `settings.blocks` blocks of whole pages, and starts at a page.
         // `turns` is dropped before the mapping. The other side is the kernel, which follows the
         // TPACKET_V3 protocol.
-        let turns = unsafe { Turns::new(memory.start.cast(), block_size, settings.blocks) };
+        let turns = unsafe { BlockReader::new(memory.start.cast(), block_size, settings.blocks) };
         let ring = Self {
             turns,
             _memory: memory,

@@ -19,21 +19,21 @@ use ros2probe_model::observe::observer::Observer;
 use ros2probe_model::report::snapshot::SocketFacts;
 
 /// Interval of searches for new sockets: every second round of an idle agent.
-const PERIOD: u64 = 19 * SECOND / 10;
+const SEARCH_INTERVAL: u64 = 19 * SECOND / 10;
 /// Minimum interval while a connection of Zenoh begins, which may last for less than a second.
-const SOON: u64 = SECOND / 10;
+const SHORT_SEARCH_INTERVAL: u64 = SECOND / 10;
 /// Interval of reading all owners again, because sockets are closed and their drops increase.
-const ALL_PERIOD: u64 = 15 * SECOND;
+const FULL_SEARCH_INTERVAL: u64 = 15 * SECOND;
 /// Maximum number of queries for an owner that was not found.
-const MOST_QUESTIONS: u8 = 3;
+const MAX_REQUESTS: u8 = 3;
 
 /// State of all sockets.
 #[derive(Debug)]
 pub struct Sockets {
     groups: CgroupPaths,
     known: BTreeMap<u64, Known>,
-    looked: u64,
-    asked: u64,
+    last_search: u64,
+    last_request: u64,
     failed: bool,
 }
 
@@ -42,7 +42,7 @@ struct Known {
     owner: Option<Owner>,
     /// Unattributed drops when the socket's owner was first found.
     dropped_before: Option<u64>,
-    questions: u8,
+    requests: u8,
     /// Value of the hook's counter at the last report to the model.
     rcvbuf_errors: u64,
     reported: Option<SocketFacts>,
@@ -55,8 +55,8 @@ impl Sockets {
         Self {
             groups: CgroupPaths::new(hierarchy),
             known: BTreeMap::new(),
-            looked: 0,
-            asked: 0,
+            last_search: 0,
+            last_request: 0,
             failed: false,
         }
     }
@@ -64,11 +64,15 @@ impl Sockets {
     /// Queries the kernel if a query is due, and passes changes to the model.
     pub fn follow(&mut self, filter: &Filter, now: u64, observer: &mut Observer) {
         let is_awaited = observer.awaits_holders();
-        let interval = if is_awaited { SOON } else { PERIOD };
-        if now.saturating_sub(self.looked) < interval {
+        let interval = if is_awaited {
+            SHORT_SEARCH_INTERVAL
+        } else {
+            SEARCH_INTERVAL
+        };
+        if now.saturating_sub(self.last_search) < interval {
             return;
         }
-        self.looked = now;
+        self.last_search = now;
         let met: BTreeMap<u64, Socket> = filter.sockets().collect();
         self.forget(&met, observer);
         let owners = self.owners(filter.tracepoints(), &met, now);
@@ -120,13 +124,13 @@ impl Sockets {
         let owners = inside?.owners()?;
         let unknown = |cookie: &u64| {
             let known = self.known.get(cookie);
-            known.is_none_or(|known| known.owner.is_none() && known.questions < MOST_QUESTIONS)
+            known.is_none_or(|known| known.owner.is_none() && known.requests < MAX_REQUESTS)
         };
-        let due = now.saturating_sub(self.asked) >= ALL_PERIOD;
+        let due = now.saturating_sub(self.last_request) >= FULL_SEARCH_INTERVAL;
         if met.is_empty() || !(due || met.keys().any(unknown)) {
             return None;
         }
-        self.asked = now;
+        self.last_request = now;
         let found = owners.refresh(&met.keys().copied().collect());
         if let Err(error) = &found
             && !self.failed
@@ -145,12 +149,12 @@ impl Sockets {
     ) {
         for (cookie, socket) in met {
             let known = self.known.entry(*cookie).or_default();
-            known.questions = known.questions.saturating_add(1);
+            known.requests = known.requests.saturating_add(1);
             let owner = owners.remove(cookie);
             if owner.is_none() && known.owner.is_some() {
                 // The last process that held the socket has closed it.
                 *known = Known {
-                    questions: MOST_QUESTIONS,
+                    requests: MAX_REQUESTS,
                     ..Known::default()
                 };
                 observer.input(Input::SocketClosed(*cookie));
@@ -167,7 +171,7 @@ impl Sockets {
 impl Known {
     /// Returns whether a process may hold the socket open.
     const fn may_be_open(&self) -> bool {
-        self.owner.is_some() || self.questions < MOST_QUESTIONS
+        self.owner.is_some() || self.requests < MAX_REQUESTS
     }
 
     /// Returns the drops of the socket beyond the attributed ones; `None` if the kernel does not
@@ -264,8 +268,8 @@ mod tests {
         let owners = BTreeMap::from([(1, owner(0)), (2, owner(0))]);
         all.poll(owners, &met, &mut observer);
         all.poll(BTreeMap::from([(2, owner(0))]), &met, &mut observer);
-        let questions = |all: &Sockets, cookie| all.known.get(&cookie).unwrap().questions;
-        assert_eq!(questions(&all, 1), MOST_QUESTIONS);
+        let questions = |all: &Sockets, cookie| all.known.get(&cookie).unwrap().requests;
+        assert_eq!(questions(&all, 1), MAX_REQUESTS);
         assert!(all.known.get(&1).unwrap().owner.is_none());
         assert_eq!(questions(&all, 2), 2);
         all.forget(&sockets(&[2], 0), &mut observer);

@@ -13,9 +13,9 @@ use ros2probe_wire::Timestamp;
 use rustix::process::{DumpableBehavior, set_dumpable_behavior};
 
 /// Maximum number of attempts to read the clocks.
-const READINGS: usize = 8;
+const MAX_READINGS: usize = 8;
 /// Maximum time between two clock readings that count as simultaneous, in nanoseconds.
-const CLOSE: u64 = 5_000;
+const MAX_READING_NANOSECONDS: u64 = 5_000;
 
 /// Waits until one of `descriptors` is readable or in error, a signal arrives, or the timeout
 /// expires. Returns the index of the first such descriptor.
@@ -201,8 +201,8 @@ impl Clocks {
     #[must_use]
     pub fn read() -> Self {
         let mut best = Self::read_once();
-        for _ in 1..READINGS {
-            if best.1 <= CLOSE {
+        for _ in 1..MAX_READINGS {
+            if best.1 <= MAX_READING_NANOSECONDS {
                 break;
             }
             let again = Self::read_once();
@@ -231,20 +231,20 @@ impl Clocks {
     /// Converts a monotonic time to a wall-clock time. The result is wrong by the step if the wall
     /// clock was set in between.
     #[must_use]
-    pub const fn calendar(&self, monotonic: u64) -> Timestamp {
+    pub const fn wall_time_of(&self, monotonic: u64) -> Timestamp {
         let ago = self.monotonic.wrapping_sub(monotonic);
         Timestamp(self.now.0.wrapping_sub(ago))
     }
 
-    /// Returns the wall-clock time of an event with the timestamp `calendar`. Just after the clock
+    /// Returns the wall-clock time of an event with the timestamp `wall_time`. Just after the clock
     /// was set, a timestamp from before the step is corrected. A timestamp that is not recent
     /// becomes now.
     #[must_use]
-    pub const fn stamped(&self, calendar: Timestamp) -> Timestamp {
-        if self.step == 0 || self.is_recent(calendar) {
-            return calendar;
+    pub const fn stamped(&self, wall_time: Timestamp) -> Timestamp {
+        if self.step == 0 || self.is_recent(wall_time) {
+            return wall_time;
         }
-        let moved = Timestamp(calendar.0.saturating_add_signed(self.step));
+        let moved = Timestamp(wall_time.0.saturating_add_signed(self.step));
         if self.is_recent(moved) {
             moved
         } else {
@@ -252,15 +252,15 @@ impl Clocks {
         }
     }
 
-    const fn is_recent(&self, calendar: Timestamp) -> bool {
-        let age = self.now.nanoseconds_since(calendar);
+    const fn is_recent(&self, wall_time: Timestamp) -> bool {
+        let age = self.now.nanoseconds_since(wall_time);
         age > -RECENT_NANOSECONDS / 10 && age < RECENT_NANOSECONDS
     }
 
     /// Converts a past wall-clock time to a monotonic time; a future one becomes now.
     #[must_use]
-    pub const fn monotonic_of(&self, calendar: Timestamp) -> u64 {
-        let ago = self.now.0.saturating_sub(calendar.0);
+    pub const fn monotonic_of(&self, wall_time: Timestamp) -> u64 {
+        let ago = self.now.0.saturating_sub(wall_time.0);
         self.monotonic.saturating_sub(ago)
     }
 }
@@ -275,7 +275,7 @@ pub fn raw_difference() -> u64 {
         let within = nanoseconds(libc::CLOCK_MONOTONIC).saturating_sub(before);
         (within, raw.wrapping_sub(before + within / 2))
     };
-    let readings = std::iter::repeat_with(read).take(READINGS);
+    let readings = std::iter::repeat_with(read).take(MAX_READINGS);
     readings.min().unwrap_or_default().1
 }
 
@@ -287,7 +287,7 @@ pub fn monotonic() -> u64 {
 
 /// Returns nanoseconds since the Unix epoch.
 #[must_use]
-pub fn calendar() -> u64 {
+pub fn wall_clock_nanoseconds() -> u64 {
     nanoseconds(libc::CLOCK_REALTIME)
 }
 
@@ -408,7 +408,7 @@ mod tests {
     #[test]
     fn a_monotonic_time_converts_to_the_calendar_time_of_the_same_moment() {
         let clocks = Clocks::read();
-        let then = clocks.calendar(clocks.monotonic - 1_000_000_000);
+        let then = clocks.wall_time_of(clocks.monotonic - 1_000_000_000);
         assert_eq!(clocks.now.nanoseconds_since(then), 1_000_000_000);
     }
 }

@@ -46,7 +46,7 @@ impl Progress {
     }
 
     /// Records that the thread waits for work, or ends.
-    pub fn rest(&self) {
+    pub fn set_idle(&self) {
         self.step.store(0, Ordering::Release);
     }
 
@@ -76,7 +76,7 @@ mod tests {
         assert_eq!(progress.stalled_at(later(3)), None);
         let long = progress.stalled_at(later(5)).unwrap();
         assert!(long > STALLED_AFTER && long < Duration::from_secs(6));
-        progress.rest();
+        progress.set_idle();
         assert_eq!(progress.stalled_at(later(3600)), None, "waits");
         progress.step();
         assert_eq!(progress.stalled(), None, "the next step");

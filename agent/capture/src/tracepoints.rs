@@ -36,14 +36,14 @@ pub struct KernelLayout {
 }
 
 /// Enumeration of drop reasons, since Linux 5.17. Reasons for fragments exist since 6.2.
-const REASONS: &str = "skb_drop_reason";
+const DROP_REASON_ENUM: &str = "skb_drop_reason";
 
 /// First release that reports IPv6 datagrams dropped at a full socket buffer.
 const REPORTS_IPV6: (u32, u32) = (6, 6);
 
 /// Kernel name of each entry: a member of a structure, an enumerator, or a structure whose size is
 /// read.
-const TABLE: [(Layout, &str, &str); Layout::COUNT] = [
+const LAYOUT_MEMBERS: [(Layout, &str, &str); Layout::COUNT] = [
     (Layout::BufferHead, "sk_buff", "head"),
     (Layout::BufferTail, "sk_buff", "tail"),
     (Layout::BufferNetworkHeader, "sk_buff", "network_header"),
@@ -51,21 +51,29 @@ const TABLE: [(Layout, &str, &str); Layout::COUNT] = [
     (Layout::BufferInterface, "sk_buff", "skb_iif"),
     (
         Layout::ReasonBufferFull,
-        REASONS,
+        DROP_REASON_ENUM,
         "SKB_DROP_REASON_SOCKET_RCVBUFF",
     ),
-    (Layout::ReasonMemory, REASONS, "SKB_DROP_REASON_PROTO_MEM"),
+    (
+        Layout::ReasonMemory,
+        DROP_REASON_ENUM,
+        "SKB_DROP_REASON_PROTO_MEM",
+    ),
     (
         Layout::ReasonTimeout,
-        REASONS,
+        DROP_REASON_ENUM,
         "SKB_DROP_REASON_FRAG_REASM_TIMEOUT",
     ),
     (
         Layout::ReasonTooFar,
-        REASONS,
+        DROP_REASON_ENUM,
         "SKB_DROP_REASON_FRAG_TOO_FAR",
     ),
-    (Layout::ReasonNone, REASONS, "SKB_DROP_REASON_NOT_SPECIFIED"),
+    (
+        Layout::ReasonNone,
+        DROP_REASON_ENUM,
+        "SKB_DROP_REASON_NOT_SPECIFIED",
+    ),
     (Layout::BufferDevice, "sk_buff", "dev"),
     (Layout::DeviceNamespace, "net_device", "nd_net"),
     (Layout::NamespaceFragments4, "net", "ipv4.fqdir"),
@@ -144,9 +152,9 @@ impl KernelLayout {
 
     fn of(types: &KernelTypes) -> Self {
         let mut array = [Layout::ABSENT; Layout::COUNT];
-        for (place, structure, member) in TABLE {
+        for (place, structure, member) in LAYOUT_MEMBERS {
             let value = match (structure, member) {
-                (REASONS, reason) => types.enumerator(structure, reason),
+                (DROP_REASON_ENUM, reason) => types.enumerator(structure, reason),
                 (_, "") => types.size(structure),
                 (_, member) => types.offset(structure, member),
             };
@@ -173,7 +181,7 @@ impl KernelLayout {
         if let Some(unknown) = &self.unknown {
             return Err(unknown.clone());
         }
-        let absent = TABLE.iter().find(|(place, _, _)| {
+        let absent = LAYOUT_MEMBERS.iter().find(|(place, _, _)| {
             layout.contains(place) && self.array.get(*place as usize) == Some(&Layout::ABSENT)
         });
         match absent {
@@ -307,7 +315,7 @@ mod tests {
     #[test]
     fn every_layout_entry_has_exactly_one_name() {
         for index in 0..Layout::COUNT {
-            let named = TABLE
+            let named = LAYOUT_MEMBERS
                 .iter()
                 .filter(|(place, _, _)| *place as usize == index);
             assert_eq!(named.count(), 1, "{index}");

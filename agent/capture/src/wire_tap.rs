@@ -22,7 +22,7 @@ use super::reorder_buffer::{Next, ReorderBuffer, Segment as Waiting};
 use super::ring::{self, Ring, RingError, RingFrame};
 use super::streams::{Chunk, Streams, flow, flow_of};
 use super::system::Clocks;
-use crate::ahead::{Ahead, Ready};
+use crate::ahead::{Ahead, ReadyItem};
 use crate::reassembly::{FlowKey, Limits, Reassembled, Reassembly};
 use ros2probe_model::graph::zenoh::StreamId;
 use ros2probe_model::observe::input::Input;
@@ -163,7 +163,7 @@ impl WireTap {
     /// Returns a sentence about an object that is gone: the namespace, or an interface that the
     /// configuration names. `None` if all exist.
     #[must_use]
-    pub fn gone(&self) -> Option<String> {
+    pub fn missing_object(&self) -> Option<String> {
         if let (Some(path), true) = (&self.path, self.is_gone) {
             let path = path.display();
             return Some(format!(
@@ -263,7 +263,7 @@ impl WireTap {
     #[must_use]
     pub const fn incomplete_datagrams(&self) -> u64 {
         let reassembly = self.frames.reassembly.counters();
-        self.frames.ahead.given_up() + reassembly.evicted + reassembly.timed_out
+        self.frames.ahead.discarded() + reassembly.evicted + reassembly.timed_out
     }
 
     /// Returns the bytes held for reassembly.
@@ -434,7 +434,7 @@ impl FrameAssembly {
                 );
                 if let Some(rest) = self.reassembly.hand_over(at, key, &record) {
                     let ready = |each| deliver_ready(each, observer);
-                    self.ahead.rest(self.number, rest, ready);
+                    self.ahead.add_remainder(self.number, rest, ready);
                 }
             }
             let ready = |each| deliver_ready(each, observer);
@@ -448,7 +448,7 @@ impl FrameAssembly {
         self.reassembly.advance(clocks.now);
         let now = Timestamp(clocks.now.0.saturating_sub(SETTLE_NANOSECONDS));
         self.streams
-            .advance(now, |streamed| streamed.pass(observer));
+            .advance(now, |streamed| streamed.pass_to(observer));
     }
 
     /// Reads a segment of Zenoh, and passes the messages that it completes to the model.
@@ -463,7 +463,7 @@ impl FrameAssembly {
             return;
         }
         self.streams
-            .chunk(&chunk, |streamed| streamed.pass(observer));
+            .chunk(&chunk, |streamed| streamed.pass_to(observer));
     }
 
     fn frame(
@@ -502,7 +502,7 @@ impl FrameAssembly {
                 let is_quic =
                     self.streams
                         .datagram((time, stream), udp.payload, udp.length, |streamed| {
-                            streamed.pass(observer);
+                            streamed.pass_to(observer);
                         });
                 if is_quic {
                     return Ok(());
@@ -519,7 +519,7 @@ impl FrameAssembly {
                 };
                 if whole.handover.is_some() {
                     let ready = |each| deliver_ready(each, observer);
-                    self.ahead.rest(self.number, whole, ready);
+                    self.ahead.add_remainder(self.number, whole, ready);
                 } else {
                     (envelope.source_port, envelope.destination_port) =
                         (whole.source_port, whole.destination_port);
@@ -541,7 +541,7 @@ impl FrameAssembly {
                 }
                 let chunk = Chunk::of_segment(segment, time, stream);
                 self.order.segment(at, &chunk);
-                while let Some(oldest) = self.order.excess_segment() {
+                while let Some(oldest) = self.order.take_excess_segment() {
                     self.read_segment(&oldest, at_sockets, observer);
                 }
             }
@@ -564,14 +564,14 @@ fn decode_frame(
 }
 
 /// Passes a complete item to the model.
-fn deliver_ready(ready: Ready, observer: &mut Observer) {
+fn deliver_ready(ready: ReadyItem, observer: &mut Observer) {
     match ready {
-        Ready::Record(record) => observe(observer, &record),
-        Ready::Rest(rest) => decode_rest(&rest, observer),
+        ReadyItem::Record(record) => observe(observer, &record),
+        ReadyItem::Remainder(rest) => decode_remainder(&rest, observer),
     }
 }
 
-fn decode_rest(rest: &Reassembled, observer: &mut Observer) {
+fn decode_remainder(rest: &Reassembled, observer: &mut Observer) {
     let Some(record) = rest.handover else { return };
     let envelope = Envelope::of_handover(&record, rest.last_seen);
     observer.input(Input::Datagram {

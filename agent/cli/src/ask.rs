@@ -8,9 +8,9 @@ use std::time::Duration;
 
 use anyhow::{Context as _, Result, bail};
 use ros2probe::discover::announcements::Announcements;
-use ros2probe::discover::participants::{HeardParticipant, Listening, listen};
-use ros2probe::discover::session::{MOST_PACKETS, Session, Target};
-use ros2probe::discover::{converse, local_participant};
+use ros2probe::discover::participants::{FoundParticipant, Listening, listen};
+use ros2probe::discover::session::{MAX_PACKETS, Session, Target};
+use ros2probe::discover::{local_participant, run_session};
 use ros2probe_daemon::agent::configuration;
 
 use crate::cli::Discover;
@@ -30,11 +30,11 @@ pub(crate) fn discover(options: &Discover) -> Result<()> {
     };
     let participants = listen(config.capture, &listening)?;
     let seconds = options.listen;
-    let heard = match participants.len() {
+    let found = match participants.len() {
         1 => "1 participant".to_owned(),
         count => format!("{count} participants"),
     };
-    writeln!(out, "{heard} heard within {seconds} s; nothing was sent")?;
+    writeln!(out, "{found} heard within {seconds} s; nothing was sent")?;
     let mut targets = Vec::new();
     for participant in &participants {
         let described = describe(participant);
@@ -55,7 +55,7 @@ pub(crate) fn discover(options: &Discover) -> Result<()> {
     }
     let mut failed = 0;
     for (target, domain_id) in &targets {
-        let answered = ask(target, *domain_id, options, &mut out)?;
+        let answered = request_announcements(target, *domain_id, options, &mut out)?;
         failed += usize::from(!answered);
     }
     if failed > 0 {
@@ -67,7 +67,7 @@ pub(crate) fn discover(options: &Discover) -> Result<()> {
     Ok(())
 }
 
-fn describe(participant: &HeardParticipant) -> String {
+fn describe(participant: &FoundParticipant) -> String {
     let mut words = format!(
         "{}  domain {}, {}",
         participant.prefix, participant.domain_id, participant.vendor
@@ -85,13 +85,18 @@ fn describe(participant: &HeardParticipant) -> String {
 }
 
 /// Sends requests to one participant. Returns whether every request was answered.
-fn ask(target: &Target, domain_id: u32, options: &Discover, out: &mut impl Write) -> Result<bool> {
+fn request_announcements(
+    target: &Target,
+    domain_id: u32,
+    options: &Discover,
+    out: &mut impl Write,
+) -> Result<bool> {
     let (local_participant, socket) = local_participant(target, domain_id)?;
     let mut session = Session::new(local_participant, *target, !options.no_nodes);
     let will = if options.dry_run { "would" } else { "will" };
     writeln!(
         out,
-        "\n{}: {will} send at most {MOST_PACKETS} packets, from {}, normally these:",
+        "\n{}: {will} send at most {MAX_PACKETS} packets, from {}, normally these:",
         target.prefix, local_participant.address
     )?;
     for packet in session.plan() {
@@ -103,7 +108,7 @@ fn ask(target: &Target, domain_id: u32, options: &Discover, out: &mut impl Write
     }
     // The plan is printed before anything is sent.
     out.flush()?;
-    let took = converse(&mut session, &socket)
+    let took = run_session(&mut session, &socket)
         .context("the conversation failed, perhaps before the goodbye")?;
     report(&session, took, out)
 }

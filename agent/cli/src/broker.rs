@@ -21,15 +21,15 @@ use rustix::net::{
 use rustix::process::{getpid, set_child_subreaper};
 
 /// Time without a connection after which a broker exits if systemd started it on demand.
-const IDLE: Duration = Duration::from_secs(10);
+const IDLE_TIMEOUT: Duration = Duration::from_secs(10);
 /// A broker that was started by hand does not exit when it is idle.
-const FOREVER: Duration = Duration::from_secs(u64::MAX / 4);
+const NO_IDLE_TIMEOUT: Duration = Duration::from_secs(u64::MAX / 4);
 /// Maximum number of connections that wait to be accepted.
-const WAITING: i32 = 8;
+const MAX_WAITING_CONNECTIONS: i32 = 8;
 const NO_SOCKET: &str =
     "standard input is not a socket: start ros2probe-attach.socket, or pass --listen PATH";
 /// Permissions of the socket. The broker itself accepts one user only.
-const PERMISSIONS: u32 = 0o666;
+const SOCKET_MODE: u32 = 0o666;
 
 /// Answers requests of agents for breakpoints and for facts of other processes. `path` is a new
 /// socket. Without it, standard input is the listening socket of systemd, or the connection of the
@@ -41,14 +41,14 @@ pub(crate) fn run(path: Option<&Path>, user: &str) -> Result<()> {
     let _log = Log::start(Level::Info, None);
     hide_memory().context("cannot protect the memory of this process")?;
     let (listener, idle) = match path {
-        Some(path) => (bound(path)?, FOREVER),
+        Some(path) => (bound(path)?, NO_IDLE_TIMEOUT),
         None => {
             let input = io::stdin().as_fd().try_clone_to_owned()?;
             if !socket_acceptconn(&input).context(NO_SOCKET)? {
                 confine()?;
                 return serve_one(input).context("cannot answer the agent");
             }
-            (input, IDLE)
+            (input, IDLE_TIMEOUT)
         }
     };
     let id = user_id(user);
@@ -91,7 +91,7 @@ fn bound(path: &Path) -> Result<OwnedFd> {
         Err(_) => {}
     }
     bind(&socket, &address).with_context(|| format!("cannot listen at {shown}"))?;
-    std::fs::set_permissions(path, Permissions::from_mode(PERMISSIONS))?;
-    listen(&socket, WAITING)?;
+    std::fs::set_permissions(path, Permissions::from_mode(SOCKET_MODE))?;
+    listen(&socket, MAX_WAITING_CONNECTIONS)?;
     Ok(socket)
 }

@@ -14,7 +14,7 @@ pub fn text(list: &ChainList<'_>) -> String {
         if !text.is_empty() {
             text.push('\n');
         }
-        one(chain, true, &mut text);
+        write_chain(chain, true, &mut text);
         let is_this = |each: &&ExpectedChain<'_>| {
             (&each.from, &each.to, each.domain_id, each.method.as_deref())
                 == (
@@ -39,13 +39,13 @@ pub fn text(list: &ChainList<'_>) -> String {
 pub fn text_without_nodes(chains: &[Chain<'_>]) -> String {
     let mut text = String::new();
     for chain in chains {
-        one(chain, false, &mut text);
+        write_chain(chain, false, &mut text);
         text.push('\n');
     }
     text
 }
 
-fn one(chain: &Chain<'_>, with_nodes: bool, text: &mut String) {
+fn write_chain(chain: &Chain<'_>, with_nodes: bool, text: &mut String) {
     let Chain {
         from,
         to,

@@ -57,7 +57,7 @@ impl Pose {
     }
 
     /// Returns the pose in the outer frame of a pose in this one.
-    fn then(self, inner: Self) -> Self {
+    fn compose(self, inner: Self) -> Self {
         let [x, y, z] = rotate(self.rotation, inner.translation);
         let [a, b, c] = self.translation;
         Self {
@@ -210,19 +210,19 @@ impl<'a> Frames<'a> {
         target: &str,
         history: &History,
     ) -> Result<Between, NoTransform> {
-        let [up, down] = self.ways(source, target)?;
+        let [up, down] = self.paths_to_ancestor(source, target)?;
         let stamp = common_stamp(&[&up, &down]);
-        let pose_of = |way: &[&TransformEdge<'_>]| {
-            way.iter().fold(IDENTITY, |pose, edge| {
+        let pose_of = |path: &[&TransformEdge<'_>]| {
+            path.iter().fold(IDENTITY, |pose, edge| {
                 let at_stamp = || history.pose_at(&edge.child, stamp_of(stamp));
                 let moving = (!edge.is_static).then(at_stamp).flatten();
                 let of_edge = moving.unwrap_or_else(|| Pose::of(edge));
-                of_edge.through_matrix().then(pose)
+                of_edge.through_matrix().compose(pose)
             })
         };
         Ok(Between {
             stamp,
-            pose: pose_of(&up).inverse().then(pose_of(&down)),
+            pose: pose_of(&up).inverse().compose(pose_of(&down)),
         })
     }
 
@@ -237,14 +237,14 @@ impl<'a> Frames<'a> {
         target: &str,
         history: &History,
     ) -> Result<bool, NoTransform> {
-        let ways = self.ways(source, target)?;
-        let stamp = stamp_of(common_stamp(&[&ways[0], &ways[1]]));
-        let mut moving = ways.iter().flatten().filter(|edge| !edge.is_static);
+        let paths = self.paths_to_ancestor(source, target)?;
+        let stamp = stamp_of(common_stamp(&[&paths[0], &paths[1]]));
+        let mut moving = paths.iter().flatten().filter(|edge| !edge.is_static);
         Ok(moving.all(|edge| history.pose_at(&edge.child, stamp).is_some()))
     }
 
     /// Returns the edges from each of two frames up to their nearest common ancestor.
-    fn ways(
+    fn paths_to_ancestor(
         &self,
         source: &str,
         target: &str,
@@ -257,8 +257,8 @@ impl<'a> Frames<'a> {
         let Some((common, _)) = common else {
             return Err(NoTransform::Apart(source.to_owned(), target.to_owned()));
         };
-        Ok([&from, &to].map(|way| {
-            let below = way.iter().take_while(|(frame, _)| frame != common);
+        Ok([&from, &to].map(|path| {
+            let below = path.iter().take_while(|(frame, _)| frame != common);
             below.filter_map(|(_, edge)| *edge).collect()
         }))
     }
@@ -325,7 +325,7 @@ impl<'a> Frames<'a> {
                 text,
                 "{indent}{branch}{}  {}",
                 visible(&edge.child),
-                described(edge, now)
+                edge_text(edge, now)
             );
             self.branches(&edge.child, &format!("{indent}{below}"), now, seen, text);
         }
@@ -349,7 +349,7 @@ impl<'a> Frames<'a> {
                 "  {:?} -> {:?} [label={:?}];",
                 visible(&edge.parent),
                 visible(&edge.child),
-                described(edge, now)
+                edge_text(edge, now)
             );
         }
         text + "}\n"
@@ -357,8 +357,8 @@ impl<'a> Frames<'a> {
 }
 
 /// Returns the oldest of the last stamps of moving edges; zero without any.
-fn common_stamp(ways: &[&[&TransformEdge<'_>]]) -> (i32, u32) {
-    let moving = ways
+fn common_stamp(paths: &[&[&TransformEdge<'_>]]) -> (i32, u32) {
+    let moving = paths
         .iter()
         .copied()
         .flatten()
@@ -368,7 +368,7 @@ fn common_stamp(ways: &[&[&TransformEdge<'_>]]) -> (i32, u32) {
 }
 
 /// Returns rate, age and broadcasters of an edge.
-fn described(edge: &TransformEdge<'_>, now: f64) -> String {
+fn edge_text(edge: &TransformEdge<'_>, now: f64) -> String {
     let nodes = edge.broadcasters.iter().map(|each| match &each.ros_node {
         Some(node) => visible(node).into_owned(),
         None => each.writer.clone(),
@@ -508,7 +508,7 @@ mod tests {
     }
 
     #[test]
-    fn a_way_down_and_up_again_is_the_inverse() {
+    fn the_transform_in_the_opposite_direction_is_the_inverse() {
         let tree = tree();
         let frames = Frames::new(&tree);
         let there = frames
@@ -519,7 +519,7 @@ mod tests {
             .between("map", "camera", &History::default())
             .unwrap()
             .pose;
-        let same = there.then(back);
+        let same = there.compose(back);
         assert!(
             same.translation.iter().all(|number| number.abs() < 1e-9),
             "{same:?}"

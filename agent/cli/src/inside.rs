@@ -4,10 +4,10 @@ use std::borrow::Cow;
 
 use ros2probe_api::inside::{Durations, Inside, Owner, ThreadStates};
 
-use crate::top::text::{safe, seconds};
+use crate::top::text::{escaped, seconds};
 
 /// Width between two columns.
-const GAP: usize = 2;
+const COLUMN_GAP: usize = 2;
 
 /// Returns whether nothing is known.
 #[must_use]
@@ -25,10 +25,10 @@ pub fn text(inside: &Inside<'_>) -> String {
     let mut out = String::new();
     let processes = inside.processes.iter().map(|it| {
         let state = if it.suspended { "suspended" } else { "" };
-        let nodes: Vec<_> = it.nodes.iter().map(|node| safe(node)).collect();
+        let nodes: Vec<_> = it.nodes.iter().map(|node| escaped(node)).collect();
         row([
             it.process_id.to_string(),
-            it.process.as_deref().map(safe).unwrap_or_default(),
+            it.process.as_deref().map(escaped).unwrap_or_default(),
             it.domain_id.to_string(),
             it.cpu_ratio.map(percent).unwrap_or_default(),
             it.calls_per_second.map(hertz).unwrap_or_default(),
@@ -40,13 +40,13 @@ pub fn text(inside: &Inside<'_>) -> String {
     table(&mut out, head, processes);
     let publishers = inside.publishers.iter().map(|it| {
         row([
-            safe(&it.topic),
-            who(&it.owner),
+            escaped(&it.topic),
+            owner_name(&it.owner),
             it.published_messages.to_string(),
             it.within_process_messages.to_string(),
             it.rate_hertz.map(hertz).unwrap_or_default(),
             quantiles(it.interval.as_ref()),
-            it.middleware.as_deref().map(safe).unwrap_or_default(),
+            it.middleware.as_deref().map(escaped).unwrap_or_default(),
         ])
     });
     let head = [
@@ -61,13 +61,13 @@ pub fn text(inside: &Inside<'_>) -> String {
     table(&mut out, head, publishers);
     let subscriptions = inside.subscriptions.iter().map(|it| {
         row([
-            safe(&it.topic),
-            who(&it.owner),
+            escaped(&it.topic),
+            owner_name(&it.owner),
             it.taken_messages.to_string(),
             it.failed_takes.to_string(),
             it.rate_hertz.map(hertz).unwrap_or_default(),
             quantiles(it.latency.as_ref()),
-            it.middleware.as_deref().map(safe).unwrap_or_default(),
+            it.middleware.as_deref().map(escaped).unwrap_or_default(),
         ])
     });
     let head = [
@@ -82,8 +82,8 @@ pub fn text(inside: &Inside<'_>) -> String {
     table(&mut out, head, subscriptions);
     let queues = inside.reader_queues.iter().map(|it| {
         row([
-            safe(&it.topic),
-            who(&it.owner),
+            escaped(&it.topic),
+            owner_name(&it.owner),
             it.arrived_messages.to_string(),
             it.taken_messages.to_string(),
             it.lost_messages.to_string(),
@@ -95,8 +95,8 @@ pub fn text(inside: &Inside<'_>) -> String {
     let buffers = inside.buffers.iter().map(|it| {
         let capacity = it.capacity.map(|capacity| format!("/{capacity}"));
         row([
-            it.topic.as_deref().map(safe).unwrap_or_default(),
-            who(&it.owner),
+            it.topic.as_deref().map(escaped).unwrap_or_default(),
+            owner_name(&it.owner),
             it.enqueued_messages.to_string(),
             it.overwritten_messages.to_string(),
             it.rate_hertz.map(hertz).unwrap_or_default(),
@@ -116,8 +116,8 @@ pub fn text(inside: &Inside<'_>) -> String {
     table(&mut out, head, buffers);
     let callbacks = inside.callbacks.iter().map(|it| {
         row([
-            safe(&it.trigger.words()),
-            who(&it.owner),
+            escaped(&it.trigger.words()),
+            owner_name(&it.owner),
             it.calls.to_string(),
             it.busy_ratio.map(percent).unwrap_or_default(),
             it.rate_hertz.map(hertz).unwrap_or_default(),
@@ -139,7 +139,11 @@ pub fn text(inside: &Inside<'_>) -> String {
     table(&mut out, head, callbacks);
     for state in &inside.lifecycle_states {
         let node = state.node.as_deref().map_or(Cow::Borrowed("?"), Cow::from);
-        out.push_str(&format!("{} is {}\n", safe(&node), safe(&state.state)));
+        out.push_str(&format!(
+            "{} is {}\n",
+            escaped(&node),
+            escaped(&state.state)
+        ));
     }
     out
 }
@@ -177,16 +181,16 @@ fn table<const N: usize>(
     for cells in all() {
         let padded = cells.iter().zip(widths);
         let line: String = padded
-            .map(|(cell, width)| format!("{cell:<0$}", width + GAP))
+            .map(|(cell, width)| format!("{cell:<0$}", width + COLUMN_GAP))
             .collect();
         out.push_str(line.trim_end());
         out.push('\n');
     }
 }
 
-fn who(owner: &Owner<'_>) -> String {
+fn owner_name(owner: &Owner<'_>) -> String {
     let process = || format!("process {}", owner.process_id);
-    owner.node.as_deref().map_or_else(process, safe)
+    owner.node.as_deref().map_or_else(process, escaped)
 }
 
 fn hertz(rate: f64) -> String {

@@ -84,7 +84,7 @@ fn exit_code(error: &anyhow::Error) -> ExitCode {
         || error.is::<ConfineError>()
         || error
             .downcast_ref()
-            .is_some_and(CaptureError::is_for_lack_of_rights)
+            .is_some_and(CaptureError::is_permission_error)
     {
         ExitCode::from(NO_PERMISSION)
     } else if error.is::<ConfigError>()

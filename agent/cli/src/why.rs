@@ -6,10 +6,10 @@ use jiff::Timestamp;
 use jiff::tz::TimeZone;
 use ros2probe_api::why::{LateCall, LateCallback, OtherThread, Part, Why};
 
-use crate::top::text::{counted, safe, seconds};
+use crate::top::text::{counted, escaped, seconds};
 
 /// Width of a drawn bar, in characters.
-const BAR: usize = 48;
+const BAR_WIDTH: usize = 48;
 /// Stages in the order of time, in words.
 const STAGES: [(&str, &str); 6] = [
     ("publish", "until sent"),
@@ -20,7 +20,7 @@ const STAGES: [(&str, &str); 6] = [
     ("callback", "in the call"),
 ];
 /// Share of a call below which a part has no words.
-const SMALL: f64 = 0.005;
+const MIN_NAMED_SHARE: f64 = 0.005;
 
 /// Returns whether no late call is known.
 #[must_use]
@@ -39,22 +39,22 @@ pub fn text(why: &Why<'_>, zone: &TimeZone) -> String {
             "{:>4} of {all}, up to {}: {}",
             cause.late_calls,
             seconds(cause.longest_seconds),
-            safe(&cause.words)
+            escaped(&cause.words)
         );
-        let _ = writeln!(out, "     > {}", safe(&cause.remedy));
+        let _ = writeln!(out, "     > {}", escaped(&cause.remedy));
     }
     if let Some(reason) = &why.reason {
-        let _ = writeln!(out, "not everything is observed: {}", safe(reason));
+        let _ = writeln!(out, "not everything is observed: {}", escaped(reason));
     }
     for callback in &why.callbacks {
         out.push('\n');
-        text_of(callback, zone, &mut out);
+        write_callback(callback, zone, &mut out);
     }
     out
 }
 
-fn text_of(callback: &LateCallback<'_>, zone: &TimeZone, out: &mut String) {
-    let node = callback.owner.node.as_deref().map(safe);
+fn write_callback(callback: &LateCallback<'_>, zone: &TimeZone, out: &mut String) {
+    let node = callback.owner.node.as_deref().map(escaped);
     let node = node.unwrap_or_else(|| format!("process {}", callback.owner.process_id));
     let calls = callback.calls.map_or_else(
         || counted(callback.late_calls, "late call"),
@@ -63,14 +63,14 @@ fn text_of(callback: &LateCallback<'_>, zone: &TimeZone, out: &mut String) {
     let _ = writeln!(
         out,
         "{node}, callback of {}: {calls}",
-        safe(&callback.trigger.words())
+        escaped(&callback.trigger.words())
     );
     if let Some(worst) = callback.examples.first() {
-        worst_call(worst, zone, out);
+        write_worst_call(worst, zone, out);
     }
 }
 
-fn worst_call(call: &LateCall<'_>, zone: &TimeZone, out: &mut String) {
+fn write_worst_call(call: &LateCall<'_>, zone: &TimeZone, out: &mut String) {
     let wait = call.wait_seconds.unwrap_or_default();
     let total = wait + call.duration_seconds;
     let _ = writeln!(
@@ -80,7 +80,7 @@ fn worst_call(call: &LateCall<'_>, zone: &TimeZone, out: &mut String) {
         time(call.timestamp_seconds, zone),
         call.thread_id,
         call.cpu,
-        safe(&call.words)
+        escaped(&call.words)
     );
     for (stage, words) in STAGES {
         let parts = call.parts.iter().filter(|part| part.stage == stage);
@@ -91,21 +91,23 @@ fn worst_call(call: &LateCall<'_>, zone: &TimeZone, out: &mut String) {
                 out,
                 "  {words:<17} {:>6}  {}",
                 seconds(sum),
-                listed(&parts, total)
+                part_list(&parts, total)
             );
         }
     }
     let _ = writeln!(out, "  [{}]", bar(&call.parts, total));
     let mut others: Vec<_> = call.others.iter().collect();
     others.sort_by(|one, other| other.seconds.total_cmp(&one.seconds));
-    let others = others.iter().filter(|other| other.seconds >= total * SMALL);
+    let others = others
+        .iter()
+        .filter(|other| other.seconds >= total * MIN_NAMED_SHARE);
     let others: Vec<_> = others
         .take(4)
         .map(|other| match other.thread_id {
             0 => format!("no one (idle CPU) {}", seconds(other.seconds)),
             _ => format!(
                 "{} {}",
-                named(other, other.process_id.to_string()),
+                thread_in_words(other, other.process_id.to_string()),
                 seconds(other.seconds)
             ),
         })
@@ -116,16 +118,16 @@ fn worst_call(call: &LateCall<'_>, zone: &TimeZone, out: &mut String) {
     if let Some(blocked) = call
         .blocked
         .as_ref()
-        .filter(|it| it.seconds >= total * SMALL)
+        .filter(|it| it.seconds >= total * MIN_NAMED_SHARE)
     {
         let system_call = match &blocked.system_call {
-            Some(name) => format!("{}({})", safe(name), safe(&blocked.argument)),
+            Some(name) => format!("{}({})", escaped(name), escaped(&blocked.argument)),
             None => "no system call".to_owned(),
         };
         let ended = blocked.ended_by.as_ref().map(|by| {
             format!(
                 ", ended by {}",
-                named(by, format!("thread {}", by.thread_id))
+                thread_in_words(by, format!("thread {}", by.thread_id))
             )
         });
         let _ = writeln!(
@@ -136,7 +138,7 @@ fn worst_call(call: &LateCall<'_>, zone: &TimeZone, out: &mut String) {
         );
     }
     if !call.cpu_limits.is_empty() {
-        let limits: Vec<_> = call.cpu_limits.iter().map(|limit| safe(limit)).collect();
+        let limits: Vec<_> = call.cpu_limits.iter().map(|limit| escaped(limit)).collect();
         let _ = writeln!(out, "  slow CPUs: {}", limits.join("; "));
     }
     let others = call
@@ -152,26 +154,28 @@ fn worst_call(call: &LateCall<'_>, zone: &TimeZone, out: &mut String) {
         let _ = writeln!(
             out,
             "  waited for {several} of {}: {}",
-            safe(&previous.trigger.words()),
+            escaped(&previous.trigger.words()),
             seconds(previous.duration_seconds)
         );
     }
 }
 
 /// Returns a thread with its id in words, its unit, and a priority other than the usual one.
-fn named(other: &OtherThread<'_>, id: String) -> String {
+fn thread_in_words(other: &OtherThread<'_>, id: String) -> String {
     let mut facts = vec![id];
-    facts.extend(other.unit.as_deref().map(safe));
+    facts.extend(other.unit.as_deref().map(escaped));
     let priority = other.priority.as_deref().filter(|it| *it != "nice 0");
-    facts.extend(priority.map(safe));
-    format!("{} ({})", safe(&other.name), facts.join(", "))
+    facts.extend(priority.map(escaped));
+    format!("{} ({})", escaped(&other.name), facts.join(", "))
 }
 
 /// Returns the parts that are not small, with their lengths.
-fn listed(parts: &[&Part<'_>], total: f64) -> String {
-    let shown = parts.iter().filter(|part| part.seconds >= total * SMALL);
+fn part_list(parts: &[&Part<'_>], total: f64) -> String {
+    let shown = parts
+        .iter()
+        .filter(|part| part.seconds >= total * MIN_NAMED_SHARE);
     let words: Vec<_> = shown
-        .map(|part| format!("{} {}", safe(&part.cause), seconds(part.seconds)))
+        .map(|part| format!("{} {}", escaped(&part.cause), seconds(part.seconds)))
         .collect();
     words.join(", ")
 }
@@ -179,17 +183,18 @@ fn listed(parts: &[&Part<'_>], total: f64) -> String {
 /// Draws the parts in the order of their time: the first letter of a cause for each share of the
 /// call.
 fn bar(parts: &[Part<'_>], total: f64) -> String {
-    let mut bar = String::with_capacity(BAR);
+    let mut bar = String::with_capacity(BAR_WIDTH);
     let mut until = 0.0;
     for part in parts {
         until += part.seconds;
         let letter = part.cause.chars().next().unwrap_or('?');
         #[expect(clippy::cast_precision_loss, reason = "a bar has few characters")]
-        while bar.len() < BAR && (bar.len() as f64 + 0.5) / BAR as f64 <= until / total {
+        while bar.len() < BAR_WIDTH && (bar.len() as f64 + 0.5) / BAR_WIDTH as f64 <= until / total
+        {
             bar.push(letter);
         }
     }
-    while bar.len() < BAR {
+    while bar.len() < BAR_WIDTH {
         bar.push(' ');
     }
     bar

@@ -46,7 +46,7 @@ use ros2probe_metrics::otlp::{
 use ros2probe_metrics::remote_write;
 
 /// Subdirectory of samples that wait for remote write.
-const QUEUE: &str = "remote_write";
+const REMOTE_WRITE_DIRECTORY: &str = "remote_write";
 
 /// Default configuration file.
 pub const DEFAULT_CONFIG: &str = "/etc/ros2probe/ros2probe.yaml";
@@ -101,7 +101,7 @@ pub struct Components<'a> {
     /// Watched topics.
     pub watches: Arc<Watches>,
     /// Writer of the discovery state.
-    pub keeper: Option<StateWriter>,
+    pub state_writer: Option<StateWriter>,
     /// Directory of recordings. `None` means that recordings are refused.
     pub recordings: Option<PathBuf>,
     /// State directory with the receipts of delivered bags. `None` means that bags are not
@@ -163,7 +163,9 @@ impl Components<'_> {
         let snapshots = match Snapshots::start(&config.recordings.snapshots, &recordings) {
             // A missing disk must not prevent observation.
             Err(refusal @ Refusal::NoDirectory)
-                if config.recordings.is_in(&config.state_directory) =>
+                if config
+                    .recordings
+                    .is_in_state_directory(&config.state_directory) =>
             {
                 tracing::error!(%refusal, "snapshots are disabled");
                 Snapshots::default()
@@ -217,7 +219,9 @@ impl Components<'_> {
             stop: self.stop,
         };
         Ok(AssembledAgent {
-            run: run.keeping(self.keeper).remembering(history),
+            run: run
+                .with_state_writer(self.state_writer)
+                .with_history(history),
             context,
             reloads,
         })
@@ -235,7 +239,7 @@ pub fn run(options: Options) -> Result<()> {
         (None, Some(_)) => (Config::default(), None),
         (file, _) => configuration(file.as_deref())?,
     };
-    let config = overridden(&configured, &options);
+    let config = with_overrides(&configured, &options);
     let log = Log::start(config.log, config.otlp.log);
     let export = export(&config)?;
     let remote_write = remote_write(&config)?;
@@ -299,12 +303,14 @@ pub fn run(options: Options) -> Result<()> {
         let inputs = remote_write::Inputs {
             metrics: Arc::new(sources.clone()),
             figures: Arc::clone(&sources.remote_write),
-            directory: state.directory().map(|state| state.path().join(QUEUE)),
+            directory: state
+                .directory()
+                .map(|state| state.path().join(REMOTE_WRITE_DIRECTORY)),
         };
         let started = remote_write::start(settings, inputs, privilege::spawn_export);
         exporters.push(started.context("remote write cannot start")?);
     }
-    let powerless = give_up()?;
+    let powerless = drop_privileges()?;
     report_listeners(server.as_ref(), &control, viewers.as_ref(), &watches);
 
     let mut observer = Observer::new(settings(&config, options.replay.is_none()));
@@ -320,8 +326,8 @@ pub fn run(options: Options) -> Result<()> {
         spans,
         node_logs,
         watches: Arc::clone(&watches),
-        keeper: state
-            .keep(&watches)
+        state_writer: state
+            .start_writers(&watches)
             .context("cannot start the threads that keep state")?,
         recordings,
         receipts: receipts.filter(|_| config.ship.url.is_some()),
@@ -353,7 +359,7 @@ pub fn run(options: Options) -> Result<()> {
         control,
         viewers,
         context: agent.context,
-        powerless,
+        unprivileged: powerless,
     };
     let ended = supervise(
         supervisor,
@@ -373,10 +379,10 @@ pub fn run(options: Options) -> Result<()> {
 }
 
 /// Returns the configuration with the overrides of the command line.
-fn overridden(configured: &Config, options: &Options) -> Config {
+fn with_overrides(configured: &Config, options: &Options) -> Config {
     let mut config = configured.clone();
     if let Some(private) = &options.private {
-        private.apply(&mut config);
+        private.restrict(&mut config);
     }
     if options.replay.is_some() && options.config.is_none() {
         // The receivers in the configuration of the installed agent are for the robot's present.
@@ -396,7 +402,7 @@ fn overridden(configured: &Config, options: &Options) -> Config {
         None if options.report => config.foxglove.listen = None,
         None => {}
     }
-    control::choose(
+    control::apply_options(
         &mut config.api,
         options.api,
         options.api_loopback,
@@ -507,8 +513,8 @@ struct KeptState {
     directory: Option<Arc<StateDirectory>>,
     known: Option<Memory>,
     /// Whether discovery state and watches may be overwritten.
-    keeps_known: bool,
-    keeps_watches: bool,
+    may_overwrite_discovery: bool,
+    may_overwrite_watches: bool,
 }
 
 impl KeptState {
@@ -526,8 +532,8 @@ impl KeptState {
         Self {
             directory,
             known,
-            keeps_known,
-            keeps_watches,
+            may_overwrite_discovery: keeps_known,
+            may_overwrite_watches: keeps_watches,
         }
     }
 
@@ -549,14 +555,14 @@ impl KeptState {
     }
 
     /// Starts the threads that write watches and discovery state.
-    fn keep(self, watches: &Watches) -> std::io::Result<Option<StateWriter>> {
+    fn start_writers(self, watches: &Watches) -> std::io::Result<Option<StateWriter>> {
         let Some(directory) = self.directory else {
             return Ok(None);
         };
-        if self.keeps_watches {
+        if self.may_overwrite_watches {
             watches.keep_in(Arc::clone(&directory))?;
         }
-        let keeps_known = self.keeps_known;
+        let keeps_known = self.may_overwrite_discovery;
         keeps_known
             .then(|| StateWriter::start(directory))
             .transpose()
@@ -589,7 +595,7 @@ fn listeners(config: &Config, sources: &MetricSources) -> Result<(Option<Server>
 }
 
 /// Drops the privileges of this thread, and verifies that none is left.
-fn give_up() -> Result<Unprivileged> {
+fn drop_privileges() -> Result<Unprivileged> {
     privilege::confine(Role::Service)?;
     let powerless = Unprivileged::verify()?;
     if let Sandbox::Unfiltered(reason) = privilege::sandbox() {
@@ -605,10 +611,10 @@ fn report_listeners(
     watches: &Watches,
 ) {
     if let Some(address) = server.and_then(|server| server.local_addr().ok()) {
-        let watches = watches.in_force().entries().len();
+        let watches = watches.active().entries().len();
         tracing::info!(%address, watches, "serving metrics");
     }
-    for door in control.doors() {
+    for door in control.listener_addresses() {
         tracing::info!(address = door, "serving the control API");
     }
     if let Some(address) = viewers.and_then(foxglove::Server::address) {

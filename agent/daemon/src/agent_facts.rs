@@ -24,17 +24,17 @@ pub struct AgentFacts {
     /// Missing abilities that the source gains while a client needs them.
     pub on_demand: Vec<Ability>,
     /// Reasons for missing abilities, as text. Not every missing ability has one.
-    pub blind: Vec<(Ability, String)>,
+    pub missing_abilities: Vec<(Ability, String)>,
     /// Observed object that no longer exists, as text; its traffic is not observed.
-    pub gone: Option<String>,
+    pub missing_object: Option<String>,
     /// Part of the source that makes no progress, as text.
     pub stalled: Option<String>,
     /// Part of the source that is not observed yet after the start, as text.
     pub pending: Option<String>,
     /// Number of times the host hook was attached again to a recreated control group.
-    pub attached_anew: u64,
+    pub reattachments: u64,
     /// Time at which these facts were collected.
-    pub at: Instant,
+    pub collected_at: Instant,
     /// Time of the source's last return from a wait, with or without packets.
     pub capture_progress: Instant,
     /// Whether a replay has reached its end.
@@ -101,7 +101,7 @@ pub struct InsideSourceFacts {
     /// `topics`, `full` or `auto`.
     pub mode: &'static str,
     /// Whether calls are observed on demand, and no client needs them.
-    pub is_resting: bool,
+    pub is_idle: bool,
     /// Whether calls have been observed for long enough to show rates.
     pub shows_rates: bool,
     /// Observed libraries.
@@ -139,7 +139,7 @@ pub struct SharedMemoryFacts {
     /// CPU time used, in seconds.
     pub cpu_seconds: f64,
     /// Number of polls.
-    pub looks: u64,
+    pub polls: u64,
 }
 
 /// Kind of a packet source.
@@ -198,12 +198,12 @@ impl AgentFacts {
             source_reason: None,
             abilities: source.abilities().to_vec(),
             on_demand: Vec::new(),
-            blind: Vec::new(),
-            gone: None,
+            missing_abilities: Vec::new(),
+            missing_object: None,
             stalled: None,
             pending: None,
-            attached_anew: 0,
-            at,
+            reattachments: 0,
+            collected_at: at,
             capture_progress: at,
             finished: false,
             capture_begin: None,
@@ -296,7 +296,7 @@ pub struct SubscriptionFacts {
     /// Refused subscriptions since the start.
     pub refused: u64,
     /// Samples put into queues since the start, per reader.
-    pub given: u64,
+    pub enqueued: u64,
     /// Samples not delivered since the start, per reader, in the order of [`MissedReason::ALL`].
     pub missed: [u64; MissedReason::ALL.len()],
     /// Samples of `missed` that were evicted because all queues together were full.

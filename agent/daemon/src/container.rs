@@ -40,18 +40,18 @@ pub(crate) fn restrictions(config: &Config) -> Vec<Restriction> {
     if !is_container() {
         return Vec::new();
     }
-    let mut found = of_namespaces(config);
+    let mut found = namespace_restrictions(config);
     if config.capture.source != SourceChoice::Wire {
         found.extend(cgroup(config));
     }
-    found.extend(unwritable(&config.state_directory));
+    found.extend(state_restriction(&config.state_directory));
     found
 }
 
 /// Returns which namespaces and directories of the host the container withholds; nothing outside of
 /// containers. With `capture.source: wire` the agent observes its own network namespace by choice.
 #[must_use]
-pub fn of_namespaces(config: &Config) -> Vec<Restriction> {
+pub fn namespace_restrictions(config: &Config) -> Vec<Restriction> {
     if !is_container() || config.capture.source == SourceChoice::Wire {
         return Vec::new();
     }
@@ -69,7 +69,7 @@ pub fn of_namespaces(config: &Config) -> Vec<Restriction> {
         let sentence = "interfaces are those of the container, so the host's are not observed";
         found.push(restriction("network", sentence, "--network host"));
     }
-    if config.capture.shm.mode != ShmMode::Off && !has_own_processes() && !shares_memory() {
+    if config.capture.shm.mode != ShmMode::Off && !has_own_processes() && !shares_host_memory() {
         let sentence = "/dev/shm is not the host's, so its shared memory is not observed";
         let option = "--volume /dev/shm:/dev/shm:ro";
         found.push(restriction("shm", sentence, option));
@@ -93,7 +93,7 @@ fn cgroup(config: &Config) -> Option<Restriction> {
 
 /// Returns whether the shared memory of this process is the host's, as far as the first process
 /// shows.
-fn shares_memory() -> bool {
+fn shares_host_memory() -> bool {
     let host = fs::read_to_string(FIRST_MOUNTS).unwrap_or_default();
     let Some((device, _)) = mount_of(SHARED_MEMORY, &host) else {
         return true;
@@ -105,11 +105,11 @@ fn shares_memory() -> bool {
 
 /// Returns the restriction of the state directory; `None` outside of containers.
 pub(crate) fn state(choice: &StateChoice) -> Option<Restriction> {
-    is_container().then(|| unwritable(choice)).flatten()
+    is_container().then(|| state_restriction(choice)).flatten()
 }
 
 /// Returns the restriction of the state directory, in a container or elsewhere.
-fn unwritable(choice: &StateChoice) -> Option<Restriction> {
+fn state_restriction(choice: &StateChoice) -> Option<Restriction> {
     let path = memory::path(choice)?;
     let directory = fs::metadata(&path).ok()?;
     let refusal = access(&path, Access::WRITE_OK).err()?;
@@ -146,13 +146,16 @@ mod tests {
 
     #[test]
     fn a_state_directory_of_another_user_is_named_with_a_user_that_may_write_it() {
-        let refused = unwritable(&StateChoice::At(PathBuf::from("/proc/sys"))).unwrap();
+        let refused = state_restriction(&StateChoice::At(PathBuf::from("/proc/sys"))).unwrap();
         assert_eq!(
             refused.to_string(),
             "/proc/sys cannot be written, so a restart loses names and added watches: add --user 0:0"
         );
-        assert_eq!(unwritable(&StateChoice::Off), None);
-        assert_eq!(unwritable(&StateChoice::At(PathBuf::from("/tmp"))), None);
+        assert_eq!(state_restriction(&StateChoice::Off), None);
+        assert_eq!(
+            state_restriction(&StateChoice::At(PathBuf::from("/tmp"))),
+            None
+        );
         let directory = tempfile::tempdir().unwrap();
         let writer = |mode| {
             fs::set_permissions(directory.path(), fs::Permissions::from_mode(mode)).unwrap();

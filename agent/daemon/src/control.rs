@@ -13,14 +13,14 @@ use ros2probe_capture::container::add;
 use crate::agent::Listen;
 
 /// Runtime directory of the package and of the service manager.
-const DEFAULT: &str = "/run/ros2probe";
+const DEFAULT_DIRECTORY: &str = "/run/ros2probe";
 /// Variable of the service manager: directories, separated by colons.
-const VARIABLE: &str = "RUNTIME_DIRECTORY";
-const SOCKET: &str = "api.sock";
+const RUNTIME_DIRECTORY_VARIABLE: &str = "RUNTIME_DIRECTORY";
+const SOCKET_NAME: &str = "api.sock";
 
 /// Applies the command line to the configuration. By default, a report has no listener, since it
 /// ends before a client could connect.
-pub(crate) fn choose(
+pub(crate) fn apply_options(
     settings: &mut ApiSettings,
     asked: Option<Listen>,
     loopback: Option<Access>,
@@ -72,10 +72,10 @@ pub(crate) fn open_socket(server: &mut Server, settings: &ApiSettings) -> Result
 
 /// Returns the path of the agent's socket; `None` without a directory for it.
 fn socket() -> Option<PathBuf> {
-    let named = std::env::var_os(VARIABLE).filter(|paths| !paths.is_empty());
+    let named = std::env::var_os(RUNTIME_DIRECTORY_VARIABLE).filter(|paths| !paths.is_empty());
     if let Some(paths) = named {
-        return Some(std::env::split_paths(&paths).next()?.join(SOCKET));
+        return Some(std::env::split_paths(&paths).next()?.join(SOCKET_NAME));
     }
-    let default = Path::new(DEFAULT);
-    default.is_dir().then(|| default.join(SOCKET))
+    let default = Path::new(DEFAULT_DIRECTORY);
+    default.is_dir().then(|| default.join(SOCKET_NAME))
 }

@@ -8,10 +8,10 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use ros2probe_history::Store;
 
 /// Subdirectory of the state directory.
-const DIRECTORY: &str = "history";
+const HISTORY_DIRECTORY: &str = "history";
 
-/// History on disk. The thread that writes it also opens it: a slow storage must not delay the start
-/// of the agent.
+/// History on disk. The thread that writes it also opens it: a slow storage must not delay the
+/// start of the agent.
 #[derive(Debug, Default)]
 pub struct DiskHistory {
     /// Directory, and maximum size in bytes; empty if no history is kept.
@@ -25,7 +25,9 @@ pub struct DiskHistory {
 impl DiskHistory {
     /// Selects the directory below the state directory, and its maximum size in bytes.
     pub fn keep_in(&self, state_directory: &Path, limit: u64) {
-        let _ = self.place.set((state_directory.join(DIRECTORY), limit));
+        let _ = self
+            .place
+            .set((state_directory.join(HISTORY_DIRECTORY), limit));
     }
 
     /// Opens the history, and logs why that fails. Returns whether a history is kept.

@@ -37,14 +37,14 @@ fn escaped(text: &str, hides: impl Fn(char) -> bool) -> Cow<'_, str> {
 }
 
 fn commands(each: char) -> bool {
-    each.is_control() || is_unseen(each)
+    each.is_control() || is_invisible(each)
 }
 
 /// Returns whether the character is invisible, changes the text direction or ends a line. These are
 /// the categories Cf, Zl and Zp, and the default ignorable characters (Unicode 16,
 /// DerivedCoreProperties.txt). The variation selectors U+FE00 to U+FE0F are excluded, since they
 /// belong to emoji.
-const fn is_unseen(each: char) -> bool {
+const fn is_invisible(each: char) -> bool {
     matches!(
         each,
         '\u{ad}'

@@ -4,9 +4,9 @@
 //! references. Each reader keeps its own position; overwritten events are counted and reported to
 //! it.
 //!
-//! Bursts are limited: at most `MOST` events of one name are kept per second, and further ones are
-//! only counted. The seconds of robot events are those of the source's clock, so a capture yields
-//! the same events at any speed.
+//! Bursts are limited: at most `MAX_EVENTS_PER_SECOND` events of one name are kept per second, and
+//! further ones are only counted. The seconds of robot events are those of the source's clock, so a
+//! capture yields the same events at any speed.
 //!
 //! A number belongs to one run of the agent. An event id also names the run, so that a position
 //! from before a restart is not mistaken for a new one.
@@ -39,16 +39,16 @@ pub use table::EVENTS;
 pub use trigger::Trigger;
 
 /// Maximum number of events of one name per second.
-const MOST: u32 = 200;
+const MAX_EVENTS_PER_SECOND: u32 = 200;
 
 /// Log of the latest events.
 #[derive(Debug)]
 pub struct EventLog {
     run: Run,
-    begun: Instant,
+    started: Instant,
     log: Mutex<Log>,
     recorded: Notify,
-    overtaken: [AtomicU64; Reader::ALL.len()],
+    overwritten_unread: [AtomicU64; Reader::ALL.len()],
 }
 
 /// One run of the agent, identified by its start time in microseconds.
@@ -82,24 +82,24 @@ struct Log {
     last: u64,
     recorded: BTreeMap<&'static str, u64>,
     /// Counts of robot events, in seconds of the source's clock.
-    robot: Storm,
+    robot: RateLimit,
     /// Counts of agent events, in seconds since its start.
-    agent: Storm,
+    agent: RateLimit,
     suppressed: u64,
 }
 
 /// Counts of events within one second.
 #[derive(Debug, Default)]
-struct Storm {
+struct RateLimit {
     second: u64,
     recorded: BTreeMap<&'static str, u32>,
-    held_back: BTreeMap<&'static str, u64>,
+    suppressed: BTreeMap<&'static str, u64>,
 }
 
 #[derive(Debug)]
 struct Entry {
     number: u64,
-    at: Timestamp,
+    time: Timestamp,
     observed: Timestamp,
     occurrence: Occurrence,
 }
@@ -116,10 +116,10 @@ impl EventLog {
     pub fn new() -> Self {
         Self {
             run: Run(wall_clock().0 / 1000),
-            begun: Instant::now(),
+            started: Instant::now(),
             log: Mutex::default(),
             recorded: Notify::new(),
-            overtaken: Default::default(),
+            overwritten_unread: Default::default(),
         }
     }
 
@@ -133,7 +133,7 @@ impl EventLog {
             log.record(event.at, Occurrence::Robot(event.kind));
         }
         for (class, count) in taken.overflow {
-            log.hold_back(group(class), count);
+            log.suppress(group(class), count);
         }
         // The model reports an event up to a second after it happened.
         log.turn_robot(clock.whole_seconds().saturating_sub(1));
@@ -224,8 +224,8 @@ impl EventLog {
     }
 
     /// Counts events that were overwritten before this reader read them.
-    pub fn overtook(&self, reader: Reader, count: u64) {
-        if let Some(overtaken) = self.overtaken.get(reader as usize) {
+    pub fn count_overwritten(&self, reader: Reader, count: u64) {
+        if let Some(overtaken) = self.overwritten_unread.get(reader as usize) {
             overtaken.fetch_add(count, Ordering::Relaxed);
         }
     }
@@ -245,7 +245,7 @@ impl EventLog {
     #[must_use]
     pub fn dropped(&self) -> Vec<(&'static str, u64)> {
         let mut dropped = vec![("storm", self.log().suppressed)];
-        let readers = Reader::ALL.iter().zip(&self.overtaken);
+        let readers = Reader::ALL.iter().zip(&self.overwritten_unread);
         dropped.extend(
             readers.map(|(reader, count)| (reader.reason(), count.load(Ordering::Relaxed))),
         );
@@ -253,10 +253,10 @@ impl EventLog {
     }
 
     fn record_at(&self, event: AgentEvent, now: Instant) {
-        let second = now.saturating_duration_since(self.begun).as_secs();
+        let second = now.saturating_duration_since(self.started).as_secs();
         let mut log = self.log();
         if second > log.agent.second {
-            for (event, count) in log.agent.turn(second) {
+            for (event, count) in log.agent.begin_second(second) {
                 let suppressed = AgentEvent::Suppressed { event, count };
                 log.append(wall_clock(), Occurrence::Agent(suppressed));
             }
@@ -291,7 +291,7 @@ impl EventSource for EventLog {
     fn read_after(&self, after: u64, most: usize) -> Batch {
         let batch = self.read(after, most);
         if batch.lagged > 0 {
-            self.overtook(Reader::Otlp, batch.lagged);
+            self.count_overwritten(Reader::Otlp, batch.lagged);
         }
         batch
     }
@@ -307,12 +307,12 @@ impl Log {
             return;
         }
         self.record_suppressed();
-        self.robot.turn(second);
+        self.robot.begin_second(second);
     }
 
     fn record_suppressed(&mut self) {
         let end = Timestamp(self.robot.second.saturating_add(1).saturating_mul(SECOND));
-        for (event, count) in std::mem::take(&mut self.robot.held_back) {
+        for (event, count) in std::mem::take(&mut self.robot.suppressed) {
             let suppressed = AgentEvent::Suppressed { event, count };
             self.append(end, Occurrence::Agent(suppressed));
         }
@@ -324,15 +324,15 @@ impl Log {
             Occurrence::Robot(_) => &mut self.robot,
             Occurrence::Agent(_) => &mut self.agent,
         };
-        if storm.admits(name) {
+        if storm.is_allowed(name) {
             self.append(at, occurrence);
         } else {
             self.suppressed += 1;
         }
     }
 
-    fn hold_back(&mut self, name: &'static str, count: u64) {
-        *self.robot.held_back.entry(name).or_default() += count;
+    fn suppress(&mut self, name: &'static str, count: u64) {
+        *self.robot.suppressed.entry(name).or_default() += count;
         self.suppressed += count;
     }
 
@@ -344,26 +344,26 @@ impl Log {
             .or_default() += 1;
         self.kept.push_back(Arc::new(Entry {
             number: self.last,
-            at,
+            time: at,
             observed: wall_clock(),
             occurrence,
         }));
     }
 }
 
-impl Storm {
+impl RateLimit {
     /// Begins a second. Returns the suppressed events of the previous second, by name.
-    fn turn(&mut self, second: u64) -> BTreeMap<&'static str, u64> {
+    fn begin_second(&mut self, second: u64) -> BTreeMap<&'static str, u64> {
         self.second = second;
         self.recorded.clear();
-        std::mem::take(&mut self.held_back)
+        std::mem::take(&mut self.suppressed)
     }
 
     /// Returns whether another event of this name is allowed; otherwise counts it as suppressed.
-    fn admits(&mut self, name: &'static str) -> bool {
+    fn is_allowed(&mut self, name: &'static str) -> bool {
         let recorded = self.recorded.entry(name).or_default();
-        if *recorded >= MOST {
-            *self.held_back.entry(name).or_default() += 1;
+        if *recorded >= MAX_EVENTS_PER_SECOND {
+            *self.suppressed.entry(name).or_default() += 1;
             return false;
         }
         *recorded += 1;
@@ -375,11 +375,11 @@ impl Entry {
     fn record(&self) -> Record {
         Record {
             number: self.number,
-            at: self.at,
+            at: self.time,
             observed: self.observed,
             definition: self.occurrence.definition(),
             severity: self.occurrence.severity(),
-            attributes: self.occurrence.attributes(self.at),
+            attributes: self.occurrence.attributes(self.time),
         }
     }
 }

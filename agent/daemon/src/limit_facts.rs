@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use super::snapshot_cell::State;
 use crate::config::{Limit, Limits};
 
-const LIMITS: usize = Limit::ALL.len();
+const LIMIT_COUNT: usize = Limit::ALL.len();
 /// Time for which a limit counts as reached after a refusal or eviction.
 const REACHED_FOR: Duration = Duration::from_secs(60);
 
@@ -34,9 +34,9 @@ pub struct LimitFacts {
 pub struct LimitFigures {
     caps: Limits,
     /// Usage of resources that have no slots.
-    used: [AtomicU64; LIMITS],
-    reached: [AtomicU64; LIMITS],
-    rises: Mutex<[Rise; LIMITS]>,
+    used: [AtomicU64; LIMIT_COUNT],
+    reached: [AtomicU64; LIMIT_COUNT],
+    rises: Mutex<[Rise; LIMIT_COUNT]>,
     slots: Mutex<Vec<(Limit, Weak<Slots>)>>,
 }
 
@@ -112,7 +112,7 @@ impl LimitFigures {
         for (rise, limit) in rises.iter_mut().zip(Limit::ALL) {
             let (_, count) = self.usage(limit, state);
             if count > rise.count {
-                rise.at = Some(state.agent.at);
+                rise.at = Some(state.agent.collected_at);
             }
             rise.count = count;
         }
@@ -120,9 +120,10 @@ impl LimitFigures {
 
     /// Returns the state of all caps, with the model's counters from `state`.
     #[must_use]
-    pub fn facts(&self, state: &State) -> [LimitFacts; LIMITS] {
+    pub fn facts(&self, state: &State) -> [LimitFacts; LIMIT_COUNT] {
         let rises = *self.rises.lock().unwrap_or_else(PoisonError::into_inner);
-        let is_recent = |at: Instant| state.agent.at.saturating_duration_since(at) < REACHED_FOR;
+        let is_recent =
+            |at: Instant| state.agent.collected_at.saturating_duration_since(at) < REACHED_FOR;
         Limit::ALL.map(|limit| {
             let (used, reached) = self.usage(limit, state);
             let cap = self.caps.get(limit) as u64;
@@ -141,7 +142,7 @@ impl LimitFigures {
     #[must_use]
     pub fn degraded(&self, state: &State) -> Option<String> {
         let all = self.facts(state).into_iter();
-        let reached = all.filter(|facts| facts.at_limit && facts.limit.blinds());
+        let reached = all.filter(|facts| facts.at_limit && facts.limit.hides_data());
         let reached = reached.map(|facts| {
             let LimitFacts {
                 limit, cap, used, ..
@@ -190,7 +191,7 @@ impl LimitFigures {
     }
 
     fn own(&self, limit: Limit) -> (u64, u64) {
-        let read = |counts: &[AtomicU64; LIMITS]| {
+        let read = |counts: &[AtomicU64; LIMIT_COUNT]| {
             let count = counts.get(limit as usize);
             count.map_or(0, |count| count.load(Ordering::Relaxed))
         };

@@ -12,11 +12,11 @@ use anyhow::anyhow;
 use ros2probe_model::graph::discovery::Memory;
 
 /// Default directory of the package and of the service manager.
-const DEFAULT: &str = "/var/lib/ros2probe";
+const DEFAULT_DIRECTORY: &str = "/var/lib/ros2probe";
 /// Variable of the service manager.
-const VARIABLE: &str = "STATE_DIRECTORY";
+const STATE_DIRECTORY_VARIABLE: &str = "STATE_DIRECTORY";
 /// Subdirectory of recordings.
-pub(crate) const RECORDINGS: &str = "recordings";
+pub(crate) const RECORDINGS_DIRECTORY: &str = "recordings";
 
 /// Opens the state directory; returns `None` if no state is saved.
 pub(crate) fn open(choice: &StateChoice) -> Option<Arc<StateDirectory>> {
@@ -43,8 +43,12 @@ pub(crate) fn path(choice: &StateChoice) -> Option<PathBuf> {
         StateChoice::Off => None,
         StateChoice::At(path) => Some(path.clone()),
         StateChoice::Auto => {
-            let named = std::env::var_os(VARIABLE).filter(|path| !path.is_empty());
-            let default = || Path::new(DEFAULT).exists().then(|| DEFAULT.into());
+            let named = std::env::var_os(STATE_DIRECTORY_VARIABLE).filter(|path| !path.is_empty());
+            let default = || {
+                Path::new(DEFAULT_DIRECTORY)
+                    .exists()
+                    .then(|| DEFAULT_DIRECTORY.into())
+            };
             named.map(PathBuf::from).or_else(default)
         }
     }
@@ -55,7 +59,7 @@ pub(crate) fn recordings(choice: &StateChoice, state: Option<&StateDirectory>) -
     match choice {
         StateChoice::Off => None,
         StateChoice::At(path) => Some(path.clone()),
-        StateChoice::Auto => Some(state?.path().join(RECORDINGS)),
+        StateChoice::Auto => Some(state?.path().join(RECORDINGS_DIRECTORY)),
     }
 }
 
@@ -64,7 +68,7 @@ pub(crate) fn load(directory: &StateDirectory) -> (Option<Memory>, bool) {
     let path = directory.path().display();
     let known = match directory.load() {
         Loaded::Newer(newer) => {
-            left_alone(&newer);
+            log_newer_state(&newer);
             return (None, false);
         }
         Loaded::Known(memory) => {
@@ -87,7 +91,7 @@ pub(crate) fn load(directory: &StateDirectory) -> (Option<Memory>, bool) {
 }
 
 /// Logs that state of a newer version is preserved, since the operator may upgrade again.
-fn left_alone(newer: &Newer) {
+fn log_newer_state(newer: &Newer) {
     let Newer {
         path,
         version,
@@ -125,7 +129,7 @@ fn load_watches(directory: &StateDirectory) -> Option<Vec<Watch>> {
     Some(match watches::load(directory) {
         LoadedWatches::Nothing => Vec::new(),
         LoadedWatches::Newer(newer) => {
-            left_alone(&newer);
+            log_newer_state(&newer);
             return None;
         }
         LoadedWatches::These(watches) => {

@@ -8,15 +8,15 @@ use ros2probe_wire::rtps::VendorId;
 
 /// Command that requests the announcements of all DDS participants. Without `--all`, it only lists
 /// the participants.
-pub const DISCOVER: &str = "sudo rp discover --all";
+pub const DISCOVER_COMMAND: &str = "sudo rp discover --all";
 /// Command that requests the discovery state of a Zenoh router.
-pub const DISCOVER_ROUTER: &str = "rp discover --router";
+pub const DISCOVER_ROUTER_COMMAND: &str = "rp discover --router";
 /// Both commands in one.
-const DISCOVER_BOTH: &str = "sudo rp discover --all && rp discover --router";
+const DISCOVER_BOTH_COMMANDS: &str = "sudo rp discover --all && rp discover --router";
 
 /// Command that makes participants repeat by TCP what they announce: it starts another participant
 /// with the same transports.
-const ANNOUNCE_BY_TCP: &str =
+const TCP_REMEDY: &str =
     "FASTDDS_BUILTIN_TRANSPORTS=LARGE_DATA ros2 node list --no-daemon --spin-time 5";
 
 /// How a participant announces its endpoints.
@@ -52,10 +52,10 @@ pub fn command(announced: impl IntoIterator<Item = Announces>) -> Option<&'stati
         has_tcp |= each == Announces::Tcp;
     }
     match (has_zenoh, has_udp) {
-        (false, false) => has_tcp.then_some(ANNOUNCE_BY_TCP),
-        (false, true) => Some(DISCOVER),
-        (true, false) => Some(DISCOVER_ROUTER),
-        (true, true) => Some(DISCOVER_BOTH),
+        (false, false) => has_tcp.then_some(TCP_REMEDY),
+        (false, true) => Some(DISCOVER_COMMAND),
+        (true, false) => Some(DISCOVER_ROUTER_COMMAND),
+        (true, true) => Some(DISCOVER_BOTH_COMMANDS),
     }
 }
 
@@ -142,7 +142,7 @@ mod tests {
         assert_eq!(remedy(&[&zenoh]), Some("rp discover --router"));
         let both = remedy(&[&zenoh, &dds]).unwrap();
         assert!(
-            both.contains(DISCOVER) && both.contains(DISCOVER_ROUTER),
+            both.contains(DISCOVER_COMMAND) && both.contains(DISCOVER_ROUTER_COMMAND),
             "{both}"
         );
     }
@@ -160,9 +160,9 @@ mod tests {
             ..Participant::default()
         };
         let remedy = |by_tcp| remedy_for(std::slice::from_ref(&writer), &[participant(by_tcp)]);
-        assert_eq!(remedy(true), Some(ANNOUNCE_BY_TCP));
-        assert_eq!(remedy(false), Some(DISCOVER));
+        assert_eq!(remedy(true), Some(TCP_REMEDY));
+        assert_eq!(remedy(false), Some(DISCOVER_COMMAND));
         let both = [Announces::Tcp, Announces::Udp];
-        assert_eq!(command(both), Some(DISCOVER));
+        assert_eq!(command(both), Some(DISCOVER_COMMAND));
     }
 }

@@ -12,9 +12,9 @@ use rustix::process::{Pid, Signal, getppid, set_parent_process_death_signal};
 use crate::config::{Config, SocketChoice, StateChoice, Watch};
 
 /// Name of the API's socket in the directory.
-pub const SOCKET: &str = "api.sock";
+pub const SOCKET_NAME: &str = "api.sock";
 /// Name of the directory of bags.
-pub const RECORDINGS: &str = "recordings";
+pub const RECORDINGS_DIRECTORY: &str = "recordings";
 /// Maximum size of a bag in bytes, unless the configuration sets another one.
 pub const BAG_BYTES: u64 = 256 << 20;
 
@@ -32,19 +32,19 @@ pub struct PrivateAgent {
 impl PrivateAgent {
     /// Changes the configuration: no address is bound, nothing outside the directory is written,
     /// and every topic of the domain is measured.
-    pub(crate) fn apply(&self, config: &mut Config) {
+    pub(crate) fn restrict(&self, config: &mut Config) {
         config.metrics.listen = None;
         config.foxglove.listen = None;
         config.api.listen = None;
         config.api.token_file = None;
-        config.api.socket = SocketChoice::At(self.directory.join(SOCKET));
+        config.api.socket = SocketChoice::At(self.directory.join(SOCKET_NAME));
         config.ros2_daemon.is_on = false;
         config.otlp.endpoint = Endpoint::Off;
         config.remote_write.url = None;
         config.ship.url = None;
         config.state_directory = StateChoice::Off;
         config.history_bytes = 0;
-        config.recordings.directory = StateChoice::At(self.directory.join(RECORDINGS));
+        config.recordings.directory = StateChoice::At(self.directory.join(RECORDINGS_DIRECTORY));
         config.recordings.snapshots.clear();
         let limits = &mut config.recordings.limits;
         limits.max_bytes.get_or_insert(BAG_BYTES);
@@ -119,7 +119,7 @@ mod tests {
             domain_id: DomainId(7),
             parent: 1,
         };
-        private.apply(&mut config);
+        private.restrict(&mut config);
         config
     }
 

@@ -32,12 +32,12 @@ pub enum Jump {
 impl Pace {
     /// Returns whether the replay stands still.
     #[must_use]
-    pub const fn is_still(&self) -> bool {
+    pub const fn is_paused(&self) -> bool {
         self.is_paused && self.jump.is_none()
     }
 
-    /// Returns the speed as a multiple of that of the capture; 0 = without waiting. `started` is the
-    /// speed of the start.
+    /// Returns the speed as a multiple of that of the capture; 0 = without waiting. `started` is
+    /// the speed of the start.
     #[must_use]
     pub fn times(&self, started: Option<Speed>) -> f64 {
         match self.speed.or(started) {

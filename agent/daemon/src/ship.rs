@@ -1,10 +1,10 @@
 //! Settings of `rp ship`, from the configuration that it shares with the agent.
 
 use ros2probe_metrics::otlp::Host;
-use ros2probe_ship::{DIRECTORY, Settings, SpaceLimits};
+use ros2probe_ship::{RECORDS_DIRECTORY, Settings, SpaceLimits};
 
 use crate::config::{Config, StateChoice};
-use crate::memory::{self, RECORDINGS};
+use crate::memory::{self, RECORDINGS_DIRECTORY};
 
 /// Why bags cannot be delivered.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
@@ -34,7 +34,7 @@ pub fn settings(config: &Config) -> Result<Settings, NoShip> {
     let recordings = match &config.recordings.directory {
         StateChoice::Off => return Err(NoShip::Recordings),
         StateChoice::At(path) => path.clone(),
-        StateChoice::Auto => state.join(RECORDINGS),
+        StateChoice::Auto => state.join(RECORDINGS_DIRECTORY),
     };
     let instance = ship.instance.as_ref();
     let instance = instance.or(config.remote_write.instance.as_ref());
@@ -52,7 +52,7 @@ pub fn settings(config: &Config) -> Result<Settings, NoShip> {
         windows: ship.windows.clone(),
         triggered_always: ship.triggered_always,
         recordings,
-        state: state.join(DIRECTORY),
+        state: state.join(RECORDS_DIRECTORY),
         space: SpaceLimits {
             reserve_percent: limits.reserve_percent,
             reserve_bytes: limits.reserve_bytes,

@@ -20,12 +20,12 @@ use ros2probe_model::measure::history::Past;
 use ros2probe_model::report::snapshot::Snapshot;
 
 /// Maximum age of a state that still describes the robot.
-const FRESH: Duration = Duration::from_secs(5);
+const MAX_FRESH_AGE: Duration = Duration::from_secs(5);
 /// Number of further seconds that are published after a client has read the last seconds.
 const PAST_SECONDS: u8 = 5;
 
 /// Time for which calls inside processes are observed after the last request for them.
-const CALLS_HELD: Duration = Duration::from_secs(10);
+const REQUEST_LIFETIME: Duration = Duration::from_secs(10);
 /// Maximum number of topics and nodes about whose late calls clients ask at once.
 const MAX_LATE_QUESTIONS: usize = 16;
 
@@ -37,8 +37,8 @@ pub struct SnapshotCell {
     /// Number of further seconds that are published for a reader of the last seconds.
     past_wanted: AtomicU8,
     /// Whether a reader waits for a newer state.
-    asked: AtomicBool,
-    /// Whether the state was read since [`Self::was_read`].
+    requested: AtomicBool,
+    /// Whether the state was read since [`Self::was_snapshot_read`].
     read: AtomicBool,
     /// Time at which a client last needed calls inside processes.
     calls_wanted: ArcSwapOption<Instant>,
@@ -85,7 +85,7 @@ impl CaptureBell {
         }
     }
 
-    /// Returns the descriptor that is readable after [`Self::ring`] until [`Self::silence`]; `None`
+    /// Returns the descriptor that is readable after [`Self::ring`] until [`Self::drain`]; `None`
     /// without a socket pair.
     #[must_use]
     pub fn descriptor(&self) -> Option<BorrowedFd<'_>> {
@@ -95,7 +95,7 @@ impl CaptureBell {
     /// Discards all rings so far.
     pub fn silence(&self) {
         if let Some(bell) = &self.0 {
-            bell.silence();
+            bell.drain();
         }
     }
 }
@@ -112,7 +112,7 @@ impl SnapshotCell {
             }),
             past: ArcSwap::default(),
             past_wanted: AtomicU8::new(0),
-            asked: AtomicBool::new(false),
+            requested: AtomicBool::new(false),
             read: AtomicBool::new(false),
             calls_wanted: ArcSwapOption::empty(),
             late_wanted: Mutex::default(),
@@ -129,7 +129,7 @@ impl SnapshotCell {
             agent,
         });
         self.state.store(Arc::clone(&state));
-        self.asked.store(false, Ordering::Relaxed);
+        self.requested.store(false, Ordering::Relaxed);
         self.publication.notify_waiters();
         state
     }
@@ -142,34 +142,34 @@ impl SnapshotCell {
 
     /// Returns whether the state was read since the last call.
     #[must_use]
-    pub fn was_read(&self) -> bool {
+    pub fn was_snapshot_read(&self) -> bool {
         self.read.swap(false, Ordering::Relaxed)
     }
 
     /// Notes that a client needs calls inside processes.
-    pub fn want_calls(&self) {
+    pub fn request_calls(&self) {
         let before = self.calls_wanted.swap(Some(Arc::new(Instant::now())));
-        if before.is_none_or(|before| before.elapsed() > CALLS_HELD) {
+        if before.is_none_or(|before| before.elapsed() > REQUEST_LIFETIME) {
             self.bell.ring();
         }
     }
 
     /// Returns whether a client needed calls inside processes lately.
     #[must_use]
-    pub fn are_calls_wanted(&self, now: Instant) -> bool {
+    pub fn are_calls_requested(&self, now: Instant) -> bool {
         let wanted = self.calls_wanted.load();
         let age = wanted
             .as_deref()
             .map(|at| now.saturating_duration_since(*at));
-        age.is_some_and(|age| age <= CALLS_HELD)
+        age.is_some_and(|age| age <= REQUEST_LIFETIME)
     }
 
     /// Notes that a client requests the causes of late calls. With `above`, calls of callbacks of
     /// this topic or node, or of all, are late if they take longer.
-    pub fn want_late(&self, name: Option<&str>, above: Option<Duration>) {
-        self.want_calls();
+    pub fn request_late_calls(&self, name: Option<&str>, above: Option<Duration>) {
+        self.request_calls();
         let mut questions = self.late_questions();
-        questions.retain(|question| question.at.elapsed() <= CALLS_HELD);
+        questions.retain(|question| question.at.elapsed() <= REQUEST_LIFETIME);
         let is_same = |question: &LateQuestion| question.name.as_deref() == name;
         let question = LateQuestion {
             at: Instant::now(),
@@ -186,7 +186,7 @@ impl SnapshotCell {
     #[must_use]
     pub fn late_demand(&self, now: Instant) -> LateDemand {
         let mut questions = self.late_questions();
-        questions.retain(|question| now.saturating_duration_since(question.at) <= CALLS_HELD);
+        questions.retain(|question| now.saturating_duration_since(question.at) <= REQUEST_LIFETIME);
         let bounds = questions.iter().filter_map(|question| {
             Some(RequestedBound {
                 name: question.name.clone(),
@@ -219,7 +219,7 @@ impl SnapshotCell {
 
     /// Counts one second, and returns whether the last seconds were read lately.
     #[must_use]
-    pub fn wants_past(&self) -> bool {
+    pub fn is_history_requested(&self) -> bool {
         let left = self.past_wanted.load(Ordering::Relaxed);
         // A race with a reader only shifts the end of publishing by a second.
         self.past_wanted
@@ -256,8 +256,8 @@ impl SnapshotCell {
 
     /// Returns whether a reader waits for a newer state.
     #[must_use]
-    pub fn is_asked(&self) -> bool {
-        self.asked.load(Ordering::Relaxed)
+    pub fn is_requested(&self) -> bool {
+        self.requested.load(Ordering::Relaxed)
     }
 
     /// Returns the bell of the capture thread.
@@ -273,7 +273,7 @@ impl SnapshotCell {
         if self.state.load().agent.finished {
             return;
         }
-        self.asked.store(true, Ordering::Relaxed);
+        self.requested.store(true, Ordering::Relaxed);
         self.bell.ring();
         // After a timeout, the latest state is shown with its age.
         let _ = tokio::time::timeout(timeout, publication).await;
@@ -306,8 +306,8 @@ impl State {
     /// Returns the state of the robot; empty until the first snapshot.
     #[must_use]
     pub fn known(&self) -> &Snapshot {
-        static NOTHING: LazyLock<Snapshot> = LazyLock::new(Snapshot::default);
-        self.snapshot.as_deref().unwrap_or(&NOTHING)
+        static EMPTY_SNAPSHOT: LazyLock<Snapshot> = LazyLock::new(Snapshot::default);
+        self.snapshot.as_deref().unwrap_or(&EMPTY_SNAPSHOT)
     }
 
     /// Checks whether the state describes the robot at `now`.
@@ -318,7 +318,7 @@ impl State {
     pub fn ready(&self, now: Instant) -> Result<(), Unready> {
         self.progresses(now)?;
         let agent = &self.agent;
-        let unseen = agent.gone.as_ref().or(agent.stalled.as_ref());
+        let unseen = agent.missing_object.as_ref().or(agent.stalled.as_ref());
         let unseen = unseen.or(agent.pending.as_ref());
         unseen.map_or(Ok(()), |reason| Err(Unready::Unseen(reason.clone())))
     }
@@ -336,11 +336,11 @@ impl State {
             return Ok(());
         }
         let stuck = now.saturating_duration_since(self.agent.capture_progress);
-        if stuck > FRESH {
+        if stuck > MAX_FRESH_AGE {
             return Err(Unready::NoProgress(stuck.as_secs()));
         }
-        let age = now.saturating_duration_since(self.agent.at);
-        if age > FRESH {
+        let age = now.saturating_duration_since(self.agent.collected_at);
+        if age > MAX_FRESH_AGE {
             return Err(Unready::Outdated(age.as_secs()));
         }
         Ok(())
@@ -391,7 +391,7 @@ mod tests {
         let mut state = State {
             snapshot: Some(Arc::default()),
             agent: AgentFacts {
-                gone: Some(gone.clone()),
+                missing_object: Some(gone.clone()),
                 ..AgentFacts::new(SourceKind::Host, start)
             },
         };
@@ -399,7 +399,7 @@ mod tests {
         assert_eq!(state.progresses(start), Ok(()));
         let later = start + Duration::from_hours(1);
         assert!(state.progresses(later).is_err());
-        state.agent.gone = None;
+        state.agent.missing_object = None;
         assert_eq!(state.ready(start), Ok(()));
         // A part that makes no progress has the same effect.
         let stalled = "capture.inside: its thread has made no progress for 5 s".to_owned();
@@ -438,17 +438,20 @@ mod tests {
             ..Snapshot::default()
         };
         cell.publish(snapshot, at(0));
-        assert!(!cell.was_read());
+        assert!(!cell.was_snapshot_read());
         let mut publication = Box::pin(cell.published());
         assert!(futures_util::poll!(&mut publication).is_pending());
         cell.refresh(Duration::ZERO).await;
         cell.publish_agent(at(3));
-        assert!(futures_util::poll!(&mut publication).is_pending() && cell.is_asked());
+        assert!(futures_util::poll!(&mut publication).is_pending() && cell.is_requested());
         let own = cell.own_state();
-        assert_eq!((own.known().records, own.agent.at), (7, at(3).at));
-        assert!(!cell.was_read(), "the snapshot was not read");
+        assert_eq!(
+            (own.known().records, own.agent.collected_at),
+            (7, at(3).collected_at)
+        );
+        assert!(!cell.was_snapshot_read(), "the snapshot was not read");
         assert_eq!(cell.state().known().records, 7);
-        assert!(cell.was_read() && !cell.was_read());
+        assert!(cell.was_snapshot_read() && !cell.was_snapshot_read());
         cell.publish(Snapshot::default(), at(4));
         publication.await;
     }
@@ -457,7 +460,7 @@ mod tests {
     async fn a_refresh_waits_for_the_next_state_up_to_its_timeout() {
         let cell = SnapshotCell::new(SourceKind::Wire);
         let writer = async {
-            while !cell.is_asked() {
+            while !cell.is_requested() {
                 tokio::task::yield_now().await;
             }
             cell.publish(
@@ -466,27 +469,28 @@ mod tests {
             );
         };
         tokio::join!(cell.refresh(Duration::from_secs(3600)), writer);
-        assert!(cell.state().snapshot.is_some() && !cell.is_asked());
+        assert!(cell.state().snapshot.is_some() && !cell.is_requested());
         cell.refresh(Duration::from_millis(1)).await;
     }
 
     #[test]
     fn the_last_seconds_are_published_for_some_seconds_after_they_were_read() {
         let cell = SnapshotCell::new(SourceKind::Wire);
-        assert!(!cell.wants_past());
+        assert!(!cell.is_history_requested());
         let _ = cell.past();
-        let wanted = (0..100).filter(|_| cell.wants_past()).count();
+        let wanted = (0..100).filter(|_| cell.is_history_requested()).count();
         assert_eq!(wanted, usize::from(PAST_SECONDS));
         let _ = cell.past();
-        assert!(cell.wants_past());
+        assert!(cell.is_history_requested());
     }
 
     #[test]
     fn calls_are_wanted_until_ten_seconds_after_the_last_request() {
         let cell = SnapshotCell::new(SourceKind::Host);
-        let after = |seconds| cell.are_calls_wanted(Instant::now() + Duration::from_secs(seconds));
+        let after =
+            |seconds| cell.are_calls_requested(Instant::now() + Duration::from_secs(seconds));
         assert!(!after(0));
-        cell.want_calls();
+        cell.request_calls();
         let rings = cell.bell().descriptor().unwrap();
         assert_eq!(wait(&[rings], Duration::ZERO).unwrap(), Some(0));
         assert!(after(0) && after(9) && !after(11));
@@ -498,10 +502,10 @@ mod tests {
         let after = |seconds| cell.late_demand(Instant::now() + Duration::from_secs(seconds));
         assert_eq!(after(0), LateDemand::default());
         let above = |milliseconds| Some(Duration::from_millis(milliseconds));
-        cell.want_late(Some("/scan"), above(5));
-        cell.want_late(Some("/scan"), above(7));
+        cell.request_late_calls(Some("/scan"), above(5));
+        cell.request_late_calls(Some("/scan"), above(7));
         for _ in 0..100 {
-            cell.want_late(None, None);
+            cell.request_late_calls(None, None);
         }
         let demand = after(9);
         assert!(demand.has_question);
@@ -514,7 +518,7 @@ mod tests {
     fn questions_about_many_names_are_bounded() {
         let cell = SnapshotCell::new(SourceKind::Host);
         for number in 0..1000 {
-            cell.want_late(Some(&format!("/topic_{number}")), Some(Duration::ZERO));
+            cell.request_late_calls(Some(&format!("/topic_{number}")), Some(Duration::ZERO));
         }
         let bounds = cell.late_demand(Instant::now()).bounds;
         assert_eq!(bounds.len(), MAX_LATE_QUESTIONS);
@@ -533,6 +537,6 @@ mod tests {
         }
         assert!(rings());
         cell.bell().silence();
-        assert!(!rings() && cell.is_asked());
+        assert!(!rings() && cell.is_requested());
     }
 }

@@ -27,23 +27,23 @@ use ros2probe_model::graph::discovery::Memory;
 /// defaults. An agent that does not know a field must not accept the file. Every further change
 /// therefore needs a new version with its own reader.
 const VERSION: u32 = 1;
-const FORM: Form<Document> = Form {
-    file: FILE,
+const STATE_FORM: Form<Document> = Form {
+    file: STATE_FILE,
     readers: &[(VERSION, from_json)],
 };
-const FILE: &str = "discovery.json";
+const STATE_FILE: &str = "discovery.json";
 /// Name of the file while it is written.
-const NEW_FILE: &str = "discovery.json.new";
+const NEW_STATE_FILE: &str = "discovery.json.new";
 /// Maximum size of the file, in bytes.
 const MAX_BYTES: u64 = 64 << 20;
 /// Minimum time between two writes.
-const PERIOD: Duration = Duration::from_secs(3);
+const WRITE_INTERVAL: Duration = Duration::from_secs(3);
 /// Time after a failure until the next attempt, if nothing has changed.
 const RETRY_INTERVAL: Duration = Duration::from_secs(10);
 /// Maximum time to wait for the file system when the agent ends. An fsync on an SD card that also
 /// stores a recording takes more than ten seconds.
-pub(crate) const ENDING: Duration = Duration::from_secs(30);
-const POLL: Duration = Duration::from_millis(5);
+pub(crate) const END_TIMEOUT: Duration = Duration::from_secs(30);
+const POLL_INTERVAL: Duration = Duration::from_millis(5);
 const BOOT_ID: &str = "/proc/sys/kernel/random/boot_id";
 
 /// State directory, locked by this process.
@@ -207,7 +207,7 @@ impl StateDirectory {
         // written.
         fs::metadata(path.join(".")).map_err(unusable)?;
         // An agent that was killed during a write leaves this file.
-        let _ = fs::remove_file(path.join(NEW_FILE));
+        let _ = fs::remove_file(path.join(NEW_STATE_FILE));
         Ok(Self {
             path: path.to_path_buf(),
             directory,
@@ -225,7 +225,7 @@ impl StateDirectory {
     /// Reads the state of the previous agent. Invalid files are moved aside.
     #[must_use]
     pub fn load(&self) -> Loaded {
-        match self.read(&FORM) {
+        match self.read(&STATE_FORM) {
             Found::Nothing => Loaded::Nothing,
             Found::Newer(newer) => Loaded::Newer(newer),
             Found::This(document) if document.boot != boot() => Loaded::AnotherBoot,
@@ -244,7 +244,7 @@ impl StateDirectory {
             .and_then(|file| file.take(MAX_BYTES + 1).read_to_end(&mut bytes));
         match read {
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Found::Nothing,
-            Err(error) => return self.set_aside(file, error.to_string()),
+            Err(error) => return self.move_aside(file, error.to_string()),
             Ok(_) => {}
         }
         let known = form.readers.last().map_or(0, |(version, _)| *version);
@@ -254,8 +254,8 @@ impl StateDirectory {
             Err(error) => match begins_with_version(&bytes) {
                 // The file is too large or not JSON, but a newer version may be able to read it.
                 Some(version) if version > known => version,
-                _ if is_whole => return self.set_aside(file, error.to_string()),
-                _ => return self.set_aside(file, format!("it is larger than {MAX_BYTES} bytes")),
+                _ if is_whole => return self.move_aside(file, error.to_string()),
+                _ => return self.move_aside(file, format!("it is larger than {MAX_BYTES} bytes")),
             },
         };
         if version > known {
@@ -268,14 +268,14 @@ impl StateDirectory {
         match form.readers.iter().find(|(reads, _)| *reads == version) {
             Some((_, read)) => match read(&bytes) {
                 Ok(document) => Found::This(document),
-                Err(error) => self.set_aside(file, error.to_string()),
+                Err(error) => self.move_aside(file, error.to_string()),
             },
-            None => self.set_aside(file, format!("version {version} is not supported")),
+            None => self.move_aside(file, format!("version {version} is not supported")),
         }
     }
 
     /// Moves an unusable file aside.
-    pub(crate) fn set_aside<T>(&self, file: &str, reason: String) -> Found<T> {
+    pub(crate) fn move_aside<T>(&self, file: &str, reason: String) -> Found<T> {
         let aside = self.path.join(format!("{file}.corrupt"));
         let moved = fs::rename(self.path.join(file), &aside);
         Found::Unusable {
@@ -309,7 +309,7 @@ impl StateDirectory {
             boot: boot(),
             memory,
         };
-        self.replace(FILE, &document)
+        self.replace(STATE_FILE, &document)
     }
 }
 
@@ -385,11 +385,11 @@ impl StateWriter {
 
     /// Returns whether the state at `revision` should be passed to [`Self::keep`] now.
     #[must_use]
-    pub fn wants(&self, revision: u64, now: Instant) -> bool {
+    pub fn is_write_due(&self, revision: u64, now: Instant) -> bool {
         let is_failing = self.done.is_failing.load(Ordering::Relaxed);
         self.handed.is_none_or(|(handed, at)| {
             let age = now.saturating_duration_since(at);
-            age >= PERIOD && (handed != revision || is_failing && age >= RETRY_INTERVAL)
+            age >= WRITE_INTERVAL && (handed != revision || is_failing && age >= RETRY_INTERVAL)
         })
     }
 
@@ -402,10 +402,10 @@ impl StateWriter {
         }
     }
 
-    /// Writes the last state and waits until it is on disk, for at most [`ENDING`].
+    /// Writes the last state and waits until it is on disk, for at most [`END_TIMEOUT`].
     pub fn finish(self, memory: Memory) {
         let path = self.directory.path.clone();
-        if !self.finish_until(memory, Instant::now() + ENDING) {
+        if !self.finish_until(memory, Instant::now() + END_TIMEOUT) {
             let path = path.display();
             tracing::error!(%path, "the file system does not answer: the last state is not saved");
         }
@@ -421,7 +421,7 @@ impl StateWriter {
                 && Instant::now() < deadline
             {
                 last = Some(memory);
-                std::thread::sleep(POLL);
+                std::thread::sleep(POLL_INTERVAL);
             }
         }
         drop(inbox);
@@ -446,7 +446,7 @@ pub(crate) fn join_until(thread: JoinHandle<()>, deadline: Instant) -> bool {
         if Instant::now() >= deadline {
             return false;
         }
-        std::thread::sleep(POLL);
+        std::thread::sleep(POLL_INTERVAL);
     }
     let _ = thread.join();
     true
@@ -461,7 +461,7 @@ fn keep(
     while let Ok(memory) = inbox.recv() {
         done.progress.step();
         let written = write(memory);
-        done.progress.rest();
+        done.progress.set_idle();
         let failed_before = done.is_failing.swap(written.is_err(), Ordering::Relaxed);
         match written {
             Ok(()) => {

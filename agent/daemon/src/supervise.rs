@@ -34,10 +34,10 @@ use tokio_util::sync::CancellationToken;
 use crate::logging::Log;
 
 /// Polling intervals of readiness until the agent is ready, and of the watchdog afterwards.
-const STARTING_TICK: Duration = Duration::from_millis(100);
-const TICK: Duration = Duration::from_secs(2);
+const STARTUP_TICK_INTERVAL: Duration = Duration::from_millis(100);
+const TICK_INTERVAL: Duration = Duration::from_secs(2);
 /// Maximum time for answers in progress and for the working thread's last round.
-const DRAIN: Duration = Duration::from_secs(3);
+const DRAIN_TIMEOUT: Duration = Duration::from_secs(3);
 
 /// Supervisor of an agent.
 pub(crate) struct Supervisor {
@@ -63,7 +63,7 @@ pub(crate) struct Surfaces {
     pub(crate) viewers: Option<foxglove::Server>,
     pub(crate) context: api::Context,
     /// Proof that the serving thread has no privilege.
-    pub(crate) powerless: Unprivileged,
+    pub(crate) unprivileged: Unprivileged,
 }
 
 /// End of a thread; an error if it panicked.
@@ -114,7 +114,7 @@ impl Supervisor {
         let mut serving = responder.begin(surfaces);
         let (mut ros2_daemon, reloaded) = self.begin_ros2_daemon();
         let mut watchdog = Watchdog::new();
-        let mut tick = ticks(STARTING_TICK);
+        let mut tick = ticks(STARTUP_TICK_INTERVAL);
         let (mut working, mut answering) = (true, true);
 
         let outcome = loop {
@@ -160,7 +160,7 @@ impl Supervisor {
                 }
                 _ = tick.tick() => {
                     if watchdog.check(&self.sources.latest, &self.sources.events) {
-                        tick = ticks(watchdog.period.map_or(TICK, |period| period.min(TICK)));
+                        tick = ticks(watchdog.period.map_or(TICK_INTERVAL, |period| period.min(TICK_INTERVAL)));
                     }
                 }
             }
@@ -169,7 +169,7 @@ impl Supervisor {
         let _ = sd_notify::notify(&[NotifyState::Stopping]);
         self.stop.cancel();
         self.sources.latest.bell().ring();
-        let drained = timeout(DRAIN, async {
+        let drained = timeout(DRAIN_TIMEOUT, async {
             if working {
                 let _ = (&mut worker.ended).await;
             }
@@ -229,7 +229,7 @@ impl Supervisor {
         }
         let done = Config::load(file)
             .map_err(|error| mistakes(&error))
-            .and_then(|config| self.take_over(&config));
+            .and_then(|config| self.apply_reload(&config));
         let _ = sd_notify::notify(&[NotifyState::Ready]);
         done.map_err(|mistakes| {
             let error = mistakes.join("\n");
@@ -244,7 +244,7 @@ impl Supervisor {
         })
     }
 
-    fn take_over(&mut self, config: &Config) -> Result<Reloaded, Vec<String>> {
+    fn apply_reload(&mut self, config: &Config) -> Result<Reloaded, Vec<String>> {
         let configured = self.watches.configure(config.watches.clone());
         configured.map_err(|error| vec![error.to_string()])?;
         let needs_restart = self.config.needs_restart(config);
@@ -252,7 +252,7 @@ impl Supervisor {
             tracing::warn!(key, "the change takes effect after a restart");
         }
         self.log.set(config.log);
-        let in_force = self.watches.in_force();
+        let in_force = self.watches.active();
         let shown = in_force.watchlist().watches().to_vec();
         let watches = shown.len();
         self.sources.events.record(AgentEvent::Reloaded { watches });
@@ -325,7 +325,7 @@ impl Surfaces {
     /// Answers requests until the agent stops.
     fn answer(self) -> Result<()> {
         // Capabilities belong to threads, so those of this thread are verified, too.
-        let _: (Unprivileged, Unprivileged) = (self.powerless, Unprivileged::verify()?);
+        let _: (Unprivileged, Unprivileged) = (self.unprivileged, Unprivileged::verify()?);
         // Blocking threads create bags for clients; the unit allows 32 threads in total.
         let runtime = tokio::runtime::Builder::new_current_thread()
             .max_blocking_threads(4)
@@ -400,9 +400,9 @@ impl Worker {
 /// Notifies the service manager while the agent observes.
 struct Watchdog {
     period: Option<Duration>,
-    fed: Option<Instant>,
+    last_notification: Option<Instant>,
     ready: bool,
-    sight: SourceMonitor,
+    last_state: SourceMonitor,
 }
 
 impl Watchdog {
@@ -411,9 +411,9 @@ impl Watchdog {
         let period = sd_notify::watchdog_enabled().map(|allowed| allowed / 3);
         Self {
             period,
-            fed: None,
+            last_notification: None,
             ready: false,
-            sight: SourceMonitor::default(),
+            last_state: SourceMonitor::default(),
         }
     }
 
@@ -423,7 +423,10 @@ impl Watchdog {
         let now = Instant::now();
         let state = latest.own_state();
         let ready = state.ready(now);
-        for event in self.sight.check(&ready, state.agent.attached_anew, now) {
+        for event in self
+            .last_state
+            .check(&ready, state.agent.reattachments, now)
+        {
             events.record(event);
         }
         // A missing target does not stop the watchdog, since a restart cannot restore it.
@@ -440,10 +443,10 @@ impl Watchdog {
             return first;
         };
         if self
-            .fed
+            .last_notification
             .is_none_or(|fed| now.saturating_duration_since(fed) >= period)
         {
-            self.fed = Some(now);
+            self.last_notification = Some(now);
             let _ = sd_notify::notify(&[NotifyState::Watchdog]);
         }
         first

@@ -44,14 +44,14 @@ pub struct Entry {
 
 /// Watches in force, immutable.
 #[derive(Clone, Debug, Default)]
-pub struct InForce {
+pub struct ActiveWatches {
     entries: Vec<Entry>,
     watchlist: Arc<Watchlist>,
 }
 
 /// Result of a request to add a watch.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Done {
+pub enum AddOutcome {
     /// It was added.
     Added,
     /// It replaced a watch with other settings.
@@ -64,7 +64,7 @@ pub enum Done {
 #[derive(Debug, thiserror::Error)]
 pub enum Refused {
     /// The configuration or the command line has this watch; clients cannot override it.
-    #[error("it is defined by {}", by.phrase())]
+    #[error("it is defined by {}", by.in_sentence())]
     DefinedElsewhere {
         /// Origin of the watch.
         by: Origin,
@@ -89,14 +89,14 @@ pub enum Refused {
 #[derive(Debug)]
 pub struct Watches {
     lists: Mutex<Lists>,
-    in_force: ArcSwap<InForce>,
+    active: ArcSwap<ActiveWatches>,
     /// Latest list that the capture thread has not read yet.
     unread: ArcSwapOption<Watchlist>,
     limits: Arc<LimitFigures>,
     events: Arc<EventLog>,
     shown: Arc<SettingsCell>,
     bell: Arc<CaptureBell>,
-    keeper: OnceLock<WatchWriter>,
+    writer: OnceLock<WatchWriter>,
 }
 
 #[derive(Clone, Debug, Default)]
@@ -119,7 +119,7 @@ impl Origin {
 
     /// Returns the name within a sentence.
     #[must_use]
-    pub const fn phrase(self) -> &'static str {
+    pub const fn in_sentence(self) -> &'static str {
         match self {
             Self::Config => "the configuration file",
             Self::CommandLine => "the command line",
@@ -128,7 +128,7 @@ impl Origin {
     }
 }
 
-impl InForce {
+impl ActiveWatches {
     /// Returns all watches: of the configuration, of the command line, then of clients in order of
     /// their addition.
     #[must_use]
@@ -174,13 +174,13 @@ impl Watches {
     ) -> Result<Self, Refused> {
         let watches = Self {
             lists: Mutex::default(),
-            in_force: ArcSwap::default(),
+            active: ArcSwap::default(),
             unread: ArcSwapOption::default(),
             limits,
             events,
             shown,
             bell,
-            keeper: OnceLock::new(),
+            writer: OnceLock::new(),
         };
         let lists = Lists {
             configured: configured.into_iter().map(Arc::new).collect(),
@@ -189,7 +189,7 @@ impl Watches {
         };
         watches.change(|old, _| {
             *old = lists;
-            Ok(Done::Added)
+            Ok(AddOutcome::Added)
         })?;
         Ok(watches)
     }
@@ -201,7 +201,7 @@ impl Watches {
     ///
     /// Fails if there are too many globs; then nothing changes.
     pub fn restore(&self, watches: Vec<Watch>) -> Result<usize, Refused> {
-        let in_force = self.in_force();
+        let in_force = self.active();
         let mut room = self.cap().saturating_sub(in_force.entries().len());
         let asked = watches.len();
         let mut globs: Vec<String> = in_force.globs().map(str::to_owned).collect();
@@ -225,7 +225,7 @@ impl Watches {
         self.limits.reached(Limit::Watches, left_out);
         self.change(|lists, _| {
             lists.added = added;
-            Ok(Done::Added)
+            Ok(AddOutcome::Added)
         })?;
         Ok(left_out)
     }
@@ -238,7 +238,7 @@ impl Watches {
     pub fn keep_in(&self, directory: Arc<StateDirectory>) -> io::Result<()> {
         let keeper = WatchWriter::start(directory)?;
         // Only the first directory is used.
-        let _ = self.keeper.set(keeper);
+        let _ = self.writer.set(keeper);
         Ok(())
     }
 
@@ -246,12 +246,12 @@ impl Watches {
     /// succeeded.
     #[must_use]
     pub fn is_kept(&self) -> bool {
-        self.keeper.get().is_some_and(WatchWriter::works)
+        self.writer.get().is_some_and(WatchWriter::is_working)
     }
 
     /// Waits until watches of clients are on disk, at the end of the agent.
     pub fn finish(&self) {
-        if let Some(keeper) = self.keeper.get() {
+        if let Some(keeper) = self.writer.get() {
             keeper.finish();
         }
     }
@@ -264,7 +264,7 @@ impl Watches {
     pub fn configure(&self, watches: Vec<Watch>) -> Result<(), Refused> {
         self.change(|lists, _| {
             lists.configured = watches.into_iter().map(Arc::new).collect();
-            Ok(Done::Replaced)
+            Ok(AddOutcome::Replaced)
         })?;
         Ok(())
     }
@@ -274,7 +274,7 @@ impl Watches {
     /// # Errors
     ///
     /// Fails if it exists with other settings, or if a limit would be exceeded.
-    pub fn add(&self, watch: Watch) -> Result<Done, Refused> {
+    pub fn add(&self, watch: Watch) -> Result<AddOutcome, Refused> {
         self.put(watch, false)
     }
 
@@ -284,7 +284,7 @@ impl Watches {
     ///
     /// Fails if the configuration or the command line has it with other settings, or if a limit
     /// would be exceeded.
-    pub fn replace(&self, watch: Watch) -> Result<Done, Refused> {
+    pub fn replace(&self, watch: Watch) -> Result<AddOutcome, Refused> {
         self.put(watch, true)
     }
 
@@ -304,8 +304,8 @@ impl Watches {
             }
             lists
                 .added
-                .retain(|watch| !is_for(watch, pattern, domain_id));
-            Ok(Done::Replaced)
+                .retain(|watch| !has_identity(watch, pattern, domain_id));
+            Ok(AddOutcome::Replaced)
         })?;
         self.events.record(AgentEvent::WatchRemoved {
             watch: pattern.to_owned(),
@@ -316,8 +316,8 @@ impl Watches {
 
     /// Returns the watches in force.
     #[must_use]
-    pub fn in_force(&self) -> Arc<InForce> {
-        self.in_force.load_full()
+    pub fn active(&self) -> Arc<ActiveWatches> {
+        self.active.load_full()
     }
 
     /// For the capture thread: returns the watches, if they changed since the last call.
@@ -330,20 +330,20 @@ impl Watches {
         self.limits.caps().watches
     }
 
-    fn put(&self, watch: Watch, replace: bool) -> Result<Done, Refused> {
+    fn put(&self, watch: Watch, replace: bool) -> Result<AddOutcome, Refused> {
         let watch = Arc::new(watch);
         let done = self.change(|lists, in_force| {
             let done = match in_force.find(&watch.pattern, watch.domain_id.map(|id| id.0)) {
-                Some(old) if old.watch == watch => return Ok(Done::Unchanged),
+                Some(old) if old.watch == watch => return Ok(AddOutcome::Unchanged),
                 Some(old) if old.origin != Origin::Api => {
                     return Err(Refused::DefinedElsewhere { by: old.origin });
                 }
                 Some(_) if !replace => return Err(Refused::Different),
-                Some(_) => Done::Replaced,
-                None => Done::Added,
+                Some(_) => AddOutcome::Replaced,
+                None => AddOutcome::Added,
             };
             let same = |other: &&mut Arc<Watch>| {
-                is_for(other, &watch.pattern, watch.domain_id.map(|id| id.0))
+                has_identity(other, &watch.pattern, watch.domain_id.map(|id| id.0))
             };
             if let Some(old) = lists.added.iter_mut().find(same) {
                 *old = Arc::clone(&watch);
@@ -352,7 +352,7 @@ impl Watches {
             }
             Ok(done)
         })?;
-        if done != Done::Unchanged {
+        if done != AddOutcome::Unchanged {
             self.events.record(AgentEvent::WatchAdded {
                 watch: watch.pattern.clone(),
                 domain_id: watch.domain_id.map(|id| id.0),
@@ -366,15 +366,15 @@ impl Watches {
     /// serialized.
     fn change(
         &self,
-        change: impl FnOnce(&mut Lists, &InForce) -> Result<Done, Refused>,
-    ) -> Result<Done, Refused> {
+        change: impl FnOnce(&mut Lists, &ActiveWatches) -> Result<AddOutcome, Refused>,
+    ) -> Result<AddOutcome, Refused> {
         let mut lists = self.lists.lock().unwrap_or_else(PoisonError::into_inner);
         let mut new = lists.clone();
-        let done = change(&mut new, &self.in_force())?;
-        if done == Done::Unchanged {
+        let done = change(&mut new, &self.active())?;
+        if done == AddOutcome::Unchanged {
             return Ok(done);
         }
-        let merged = InForce::merge(&new)?;
+        let merged = ActiveWatches::merge(&new)?;
         let (count, cap) = (merged.entries.len(), self.cap());
         if count > cap {
             self.limits.reached(Limit::Watches, count - cap);
@@ -382,21 +382,21 @@ impl Watches {
         }
         self.limits.set_used(Limit::Watches, count);
         if new.added != lists.added
-            && let Some(keeper) = self.keeper.get()
+            && let Some(keeper) = self.writer.get()
         {
-            keeper.keep(new.added.clone());
+            keeper.store(new.added.clone());
         }
         *lists = new;
         self.unread.store(Some(Arc::clone(&merged.watchlist)));
         self.shown.watch(merged.watchlist.watches());
-        self.in_force.store(Arc::new(merged));
+        self.active.store(Arc::new(merged));
         drop(lists);
         self.bell.ring();
         Ok(done)
     }
 }
 
-impl InForce {
+impl ActiveWatches {
     fn merge(lists: &Lists) -> Result<Self, ManyGlobs> {
         let origins = [
             (Origin::Config, &lists.configured),
@@ -419,7 +419,7 @@ impl InForce {
     }
 }
 
-fn is_for(watch: &Watch, pattern: &str, domain_id: Option<u32>) -> bool {
+fn has_identity(watch: &Watch, pattern: &str, domain_id: Option<u32>) -> bool {
     watch.pattern == pattern && watch.domain_id == domain_id.map(DomainId)
 }
 
@@ -455,7 +455,7 @@ mod tests {
                             ..Watch::named(pattern).unwrap()
                         };
                         together.wait();
-                        matches!(watches.add(watch), Ok(Done::Added))
+                        matches!(watches.add(watch), Ok(AddOutcome::Added))
                     })
                 };
                 let threads = [add(true), add(false)];

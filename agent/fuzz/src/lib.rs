@@ -24,7 +24,7 @@ use ros2probe_capture::shm::cell::Cell;
 use ros2probe_capture::shm::classifier::MessageClassifier;
 use ros2probe_capture::shm::port::Port;
 use ros2probe_capture::shm::segment::{Buffer, Message};
-use ros2probe_capture::streams::{Before, Chunk, Streamed, Streams};
+use ros2probe_capture::streams::{Chunk, MissingBefore, Streamed, Streams};
 use ros2probe_daemon::config::{Config, Watch, Watchlist};
 use ros2probe_daemon::surface::foxglove::protocol;
 use ros2probe_daemon::surface::ros2_daemon::call::{self, Argument, Call};
@@ -71,8 +71,8 @@ pub fn capture(bytes: &[u8]) {
 }
 
 /// Reads segments of two TCP connections, and passes what they contain to the model. Five bytes
-/// precede each segment: flags, the distance from the next expected byte, how much was not captured,
-/// and the length.
+/// precede each segment: flags, the distance from the next expected byte, how much was not
+/// captured, and the length.
 pub fn stream(bytes: &[u8]) {
     const START: u64 = 1_795_143_000_000_000_000;
     let mut observer = small_observer();
@@ -101,17 +101,17 @@ pub fn stream(bytes: &[u8]) {
             end: flags & 8 != 0,
             boundary: None,
             before: match flags >> 4 & 3 {
-                1 => Before::Skipped,
-                2 => Before::Lost,
-                3 => Before::OverBudget,
-                _ => Before::Unknown,
+                1 => MissingBefore::Skipped,
+                2 => MissingBefore::Lost,
+                3 => MissingBefore::OverBudget,
+                _ => MissingBefore::Unknown,
             },
             bytes: content,
             length,
         };
         streams.chunk(&chunk, |streamed| {
             check(streamed, now);
-            streamed.pass(&mut observer);
+            streamed.pass_to(&mut observer);
         });
         observer.drain();
     }
@@ -119,7 +119,7 @@ pub fn stream(bytes: &[u8]) {
     now += 60_000_000_000;
     streams.advance(Timestamp(now), |streamed| {
         check(streamed, now);
-        streamed.pass(&mut observer);
+        streamed.pass_to(&mut observer);
     });
     for table in streams.tables() {
         assert!(table.size <= table.limit, "{table:?}");
@@ -304,7 +304,8 @@ pub fn definition(bytes: &[u8]) {
     }
 }
 
-/// Reads a reply of the TypeLookup service, then one with the bytes as a TypeObject whose hash fits.
+/// Reads a reply of the TypeLookup service, then one with the bytes as a TypeObject whose hash
+/// fits.
 pub fn type_objects(bytes: &[u8]) {
     const NAME: &str = "my_robot_msgs/msg/Part";
     let mut object = (bytes.len() as u32).to_le_bytes().to_vec();

@@ -10,7 +10,7 @@ use crate::columns::{self, Name, Row};
 use crate::rows::{ProcessName, ProcessRow, Series, TopicName, TopicRow};
 
 /// Length of a header, in bytes.
-pub(crate) const HEADER: usize = 17;
+pub(crate) const HEADER_LEN: usize = 17;
 /// Maximum length of a block on disk, without its header, in bytes.
 pub(crate) const MAX_STORED: u32 = 16 << 20;
 /// Maximum length of its content, in bytes. A damaged block cannot take more memory.
@@ -91,21 +91,21 @@ impl Block {
 
     /// Returns the block as it is stored.
     pub(crate) fn stored(&self) -> io::Result<Vec<u8>> {
-        let mut bytes = vec![0; HEADER];
+        let mut bytes = vec![0; HEADER_LEN];
         let mut encoder = DeflateEncoder::new(&mut bytes, flate2::Compression::default());
         encoder.write_all(&self.content)?;
         encoder.finish()?;
-        let stored = u32::try_from(bytes.len().saturating_sub(HEADER));
+        let stored = u32::try_from(bytes.len().saturating_sub(HEADER_LEN));
         let stored = stored.ok().filter(|stored| *stored <= MAX_STORED);
         let stored =
             stored.ok_or_else(|| io::Error::other("a block of the history is too long"))?;
-        let mut header = Vec::with_capacity(HEADER);
+        let mut header = Vec::with_capacity(HEADER_LEN);
         header.extend_from_slice(&stored.to_le_bytes());
         header.extend_from_slice(&[0; 4]);
         header.push(self.kind as u8);
         header.extend_from_slice(&self.begin.to_le_bytes());
         header.extend_from_slice(&self.end.to_le_bytes());
-        if let Some(place) = bytes.first_chunk_mut::<HEADER>() {
+        if let Some(place) = bytes.first_chunk_mut::<HEADER_LEN>() {
             place.copy_from_slice(&header);
         }
         let checksum = checksum(&bytes).to_le_bytes();
@@ -118,7 +118,7 @@ impl Block {
 
 impl Header {
     /// Reads a header. `None` if no header can look like this.
-    pub(crate) fn read(bytes: &[u8; HEADER]) -> Option<Self> {
+    pub(crate) fn read(bytes: &[u8; HEADER_LEN]) -> Option<Self> {
         let word = |at: usize| {
             let word = bytes.get(at..)?.first_chunk::<4>()?;
             Some(u32::from_le_bytes(*word))
@@ -140,7 +140,7 @@ impl Header {
             return None;
         }
         let mut content = Vec::new();
-        let decoder = DeflateDecoder::new(bytes.get(HEADER..)?);
+        let decoder = DeflateDecoder::new(bytes.get(HEADER_LEN..)?);
         decoder.take(MAX_CONTENT).read_to_end(&mut content).ok()?;
         Some(Block {
             kind: self.kind?,

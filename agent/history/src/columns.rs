@@ -97,7 +97,7 @@ impl Row for TopicRow {
         // Messages of one size leave only zeros.
         let size = size_of_message(rows);
         into.put(size);
-        differences(rows, into, |row| residue(row, size));
+        differences(rows, into, |row| remainder(row, size));
         for pair in [|row: &Self| row.latency, |row: &Self| row.interarrival] {
             for place in 0..2 {
                 differences(rows, into, |row| {
@@ -199,7 +199,7 @@ fn size_of_message(rows: &[TopicRow]) -> u64 {
 }
 
 /// Returns the bytes that the mean size does not explain.
-fn residue(row: &TopicRow, size: u64) -> i64 {
+fn remainder(row: &TopicRow, size: u64) -> i64 {
     let explained = u64::from(row.messages).wrapping_mul(size);
     row.bytes.wrapping_sub(explained) as i64
 }

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use rustix::fs::OFlags;
 
-use crate::block::{Block, HEADER, Header, Kind};
+use crate::block::{Block, HEADER_LEN, Header, Kind};
 
 /// Beginning of each file. The last byte is the version of the format.
 const SIGNATURE: [u8; 8] = *b"ros2hst\x01";
@@ -163,11 +163,11 @@ impl Reader {
 
     /// Returns the next header of a whole block, with its place.
     pub(crate) fn next(&mut self) -> Option<(Header, u64)> {
-        let mut bytes = [0; HEADER];
+        let mut bytes = [0; HEADER_LEN];
         self.file.seek(SeekFrom::Start(self.place)).ok()?;
         self.file.read_exact(&mut bytes).ok()?;
         let header = Header::read(&bytes)?;
-        let end = self.place + HEADER as u64 + u64::from(header.stored);
+        let end = self.place + HEADER_LEN as u64 + u64::from(header.stored);
         if end > self.length {
             return None;
         }
@@ -179,7 +179,7 @@ impl Reader {
     pub(crate) fn block(&mut self, header: &Header, place: u64) -> Option<Block> {
         self.file.seek(SeekFrom::Start(place)).ok()?;
         let mut bytes = Vec::new();
-        let length = HEADER as u64 + u64::from(header.stored);
+        let length = HEADER_LEN as u64 + u64::from(header.stored);
         (&mut self.file).take(length).read_to_end(&mut bytes).ok()?;
         header.block(&bytes)
     }

@@ -7,7 +7,7 @@ use crate::rows::{ProcessRow, TopicRow};
 /// A row that can be merged with a later one.
 pub trait Merge: Copy {
     /// Returns the end of the row, as Unix time.
-    fn at(&self) -> u32;
+    fn end_time(&self) -> u32;
     /// Extends this row by a later one.
     fn extend(&mut self, later: &Self);
 }
@@ -25,7 +25,7 @@ pub fn merged<R: Merge>(rows: &[R], step: u32) -> Vec<R> {
 
 /// Appends the next row of a topic or process to its steps, as [`merged`] does.
 pub fn merge_into<R: Merge>(steps: &mut Vec<R>, row: R, step: u32) {
-    let end = |row: &R| row.at().div_ceil(step.max(1));
+    let end = |row: &R| row.end_time().div_ceil(step.max(1));
     match steps.last_mut() {
         Some(last) if end(last) == end(&row) => last.extend(&row),
         _ => steps.push(row),
@@ -46,7 +46,7 @@ pub fn merge_by_name<N: Ord + Clone, R: Merge>(
 }
 
 impl Merge for TopicRow {
-    fn at(&self) -> u32 {
+    fn end_time(&self) -> u32 {
         self.at
     }
 
@@ -65,7 +65,7 @@ impl Merge for TopicRow {
 }
 
 impl Merge for ProcessRow {
-    fn at(&self) -> u32 {
+    fn end_time(&self) -> u32 {
         self.at
     }
 

@@ -10,13 +10,13 @@ use crate::file::{Blocks, FIRST_PLACE, Reader};
 use crate::store::prepare;
 
 /// A file ends after this part of the limit, so that deleting one loses few records.
-const FILES: u64 = 32;
+const FILES_PER_LIMIT: u64 = 32;
 /// Maximum number of files. The oldest of more is deleted.
 const MAX_FILES: usize = 256;
 /// Ending of the names of files.
-const EXTENSION: &str = "queue";
+const FILE_EXTENSION: &str = "queue";
 /// Name of the file with the place of the oldest waiting record.
-const PLACE: &str = "place";
+const PLACE_FILE: &str = "place";
 
 /// A bounded queue of records in a directory, the oldest first.
 ///
@@ -68,7 +68,7 @@ impl Queue {
     ///
     /// Fails if the directory cannot be read.
     pub fn open(directory: &Path, limit: u64) -> io::Result<Self> {
-        let kept = kept_place(directory);
+        let kept = read_place(directory);
         let waiting = kept.unwrap_or(Place(0, 0));
         let mut found = Vec::new();
         match fs::read_dir(directory) {
@@ -125,7 +125,7 @@ impl Queue {
     #[must_use]
     pub fn begins_file(&self) -> bool {
         let last = self.files.back().filter(|_| self.continues);
-        last.is_none_or(|last| last.blocks.length >= self.limit / FILES)
+        last.is_none_or(|last| last.blocks.length >= self.limit / FILES_PER_LIMIT)
     }
 
     /// Makes the next record the first of a file.
@@ -154,7 +154,9 @@ impl Queue {
         };
         if self.begins_file() {
             let number = self.next;
-            let path = self.directory.join(format!("{number:010}.{EXTENSION}"));
+            let path = self
+                .directory
+                .join(format!("{number:010}.{FILE_EXTENSION}"));
             let mut blocks = Blocks::create(path, at)?;
             let appended = blocks.append_durably(&[block]);
             // The power may fail at any time: the file's name must be on disk, too.
@@ -231,7 +233,7 @@ impl Queue {
         let temporary = self.directory.join("place.new");
         let Place(file, place) = self.waiting;
         let written = fs::write(&temporary, format!("{file} {place}\n"));
-        let _ = written.and_then(|()| fs::rename(&temporary, self.directory.join(PLACE)));
+        let _ = written.and_then(|()| fs::rename(&temporary, self.directory.join(PLACE_FILE)));
     }
 
     /// Deletes the files without a waiting record.
@@ -276,14 +278,14 @@ impl Queue {
 }
 
 /// Returns the place of the oldest waiting record, as [`Queue::remove`] keeps it.
-fn kept_place(directory: &Path) -> Option<Place> {
-    let text = fs::read_to_string(directory.join(PLACE)).ok()?;
+fn read_place(directory: &Path) -> Option<Place> {
+    let text = fs::read_to_string(directory.join(PLACE_FILE)).ok()?;
     let (file, place) = text.trim().split_once(' ')?;
     Some(Place(file.parse().ok()?, place.parse().ok()?))
 }
 
 /// Returns the number of a file by its name; `None` for other files.
 fn number_of(path: &Path) -> Option<u32> {
-    let is_ours = path.extension()?.to_str()? == EXTENSION;
+    let is_ours = path.extension()?.to_str()? == FILE_EXTENSION;
     path.file_stem()?.to_str()?.parse().ok().filter(|_| is_ours)
 }

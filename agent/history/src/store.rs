@@ -16,19 +16,19 @@ use crate::merge::{Merge, merge_by_name};
 use crate::rows::{ProcessName, ProcessRow, Series, TopicName, TopicRow};
 
 /// Step of the rows in [`Tier::Tens`], in seconds.
-const TEN: u32 = 10;
+const TEN_SECONDS: u32 = 10;
 /// Time of a block in [`Tier::Tens`], in seconds.
-const WINDOW: u32 = 600;
+const WINDOW_SECONDS: u32 = 600;
 /// Maximum number of these blocks that one call writes.
 const MAX_WINDOWS: usize = 12;
 /// A file ends after this part of its tier's budget, so that deleting one frees little history.
-const FILES: u64 = 24;
+const FILES_PER_TIER: u64 = 24;
 /// Maximum number of files of a tier. The oldest of more is deleted.
 const MAX_FILES: usize = 256;
 /// Free space below which nothing is written, in bytes. Other programs need the rest.
 const MIN_FREE: u64 = 64 << 20;
 /// Ending of the files' names.
-const EXTENSION: &str = "history";
+const FILE_EXTENSION: &str = "history";
 
 /// Resolution of rows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -46,8 +46,8 @@ pub struct Store {
     /// Maximum size of all files, in bytes.
     limit: u64,
     tiers: Mutex<[Vec<Blocks>; 2]>,
-    /// Unix time of the last [`Self::condense`]. Blocks that end later are those of a clock that was
-    /// set back.
+    /// Unix time of the last [`Self::condense`]. Blocks that end later are those of a clock that
+    /// was set back.
     now: AtomicU32,
 }
 
@@ -147,7 +147,7 @@ impl Store {
         let mut file = match self.files(tier).pop() {
             // After a step back of the clock, a new file keeps the two times apart.
             Some(last)
-                if last.length < budget / FILES
+                if last.length < budget / FILES_PER_TIER
                     && begin.abs_diff(last.begin) < tier.span()
                     && (tier == Tier::Seconds || first.begin >= last.end) =>
             {
@@ -211,8 +211,8 @@ impl Store {
             self.visit(Tier::Seconds, Kind::Events, &times, &mut |block| {
                 events.push(block);
             });
-            // A block that ends later belongs to the next window, because the latest end is the time up
-            // to which rows are merged.
+            // A block that ends later belongs to the next window, because the latest end is the
+            // time up to which rows are merged.
             events.retain(|block| block.end <= times.end);
             blocks.extend(events);
             self.append(Tier::Tens, &blocks)?;
@@ -250,7 +250,7 @@ impl Store {
 
     /// Visits the content of the blocks of events that overlap the times, the oldest first.
     pub fn events(&self, times: Range<u32>, each: &mut dyn FnMut(&[u8])) {
-        for (tier, times) in self.parts(times, TEN) {
+        for (tier, times) in self.parts(times, TEN_SECONDS) {
             self.visit(tier, Kind::Events, &times, &mut |block| {
                 each(&block.content);
             });
@@ -320,7 +320,7 @@ impl Store {
     ) {
         self.visit(tier, kind, times, &mut |block| {
             columns::read(&block.content, wanted, &mut |name, row: R| {
-                if row.at() > times.start && row.at() <= times.end {
+                if row.end_time() > times.start && row.end_time() <= times.end {
                     each(name, row);
                 }
             });
@@ -329,7 +329,7 @@ impl Store {
 
     /// Returns which tier has which part of the times.
     fn parts(&self, times: Range<u32>, step: u32) -> [(Tier, Range<u32>); 2] {
-        let border = if step >= TEN {
+        let border = if step >= TEN_SECONDS {
             self.condensed(self.now.load(Ordering::Relaxed))
         } else {
             let files = self.files(Tier::Seconds);
@@ -350,16 +350,16 @@ impl Store {
 
     /// Returns the next ten minutes for [`Tier::Tens`] that [`Tier::Seconds`] has whole.
     fn next_window(&self, now: u32) -> Option<Range<u32>> {
-        let whole = now / WINDOW * WINDOW;
+        let whole = now / WINDOW_SECONDS * WINDOW_SECONDS;
         let done = self.condensed(now);
         let files = self.files(Tier::Seconds);
         // A time without observation has no files, and is skipped.
         let left = files
             .iter()
             .filter(|file| file.begin < whole && file.end > done);
-        let begin = left.map(|file| file.begin.max(done)).min()? / WINDOW * WINDOW;
+        let begin = left.map(|file| file.begin.max(done)).min()? / WINDOW_SECONDS * WINDOW_SECONDS;
         let begin = begin.max(done);
-        (begin < whole).then(|| begin..(begin / WINDOW + 1) * WINDOW)
+        (begin < whole).then(|| begin..(begin / WINDOW_SECONDS + 1) * WINDOW_SECONDS)
     }
 
     /// Returns the merged rows of all topics or processes.
@@ -370,7 +370,7 @@ impl Store {
     ) -> Vec<Series<N, R>> {
         let mut all = BTreeMap::<N, Vec<R>>::new();
         self.rows(Tier::Seconds, kind, times, &|_| true, &mut |name, row| {
-            merge_by_name(&mut all, name, row, TEN);
+            merge_by_name(&mut all, name, row, TEN_SECONDS);
         });
         let series = all.into_iter();
         series.map(|(of, rows)| Series { of, rows }).collect()
@@ -383,7 +383,7 @@ impl Store {
         let last = files.last().and_then(|last| begin_of(&last.path));
         // The order of the names is that of writing.
         let number = last.map_or(begin, |last| begin.max(last.saturating_add(1)));
-        let name = format!("{}-{number:010}.{EXTENSION}", tier.name());
+        let name = format!("{}-{number:010}.{FILE_EXTENSION}", tier.name());
         self.directory.join(name)
     }
 }
@@ -413,7 +413,7 @@ fn tier_of(path: &Path) -> Option<Tier> {
 }
 
 fn begin_of(path: &Path) -> Option<u32> {
-    let is_ours = path.extension()?.to_str()? == EXTENSION;
+    let is_ours = path.extension()?.to_str()? == FILE_EXTENSION;
     let (_, number) = path.file_stem()?.to_str()?.split_once('-')?;
     number.parse().ok().filter(|_| is_ours)
 }

@@ -126,7 +126,7 @@ fn a_damaged_record_is_skipped() {
 }
 
 #[test]
-fn a_directory_that_cannot_be_written_loses_nothing_of_the_queue() {
+fn an_unwritable_directory_loses_no_record_of_the_queue() {
     let place = tempfile::tempdir().unwrap();
     fs::write(place.path().join("file"), "").unwrap();
     let mut queue = Queue::open(&place.path().join("new"), LIMIT).unwrap();
@@ -198,7 +198,7 @@ proptest! {
 }
 
 #[test]
-fn after_a_power_cut_records_of_a_new_file_wait_whatever_place_was_kept() {
+fn after_a_power_cut_all_records_of_a_new_file_are_waiting() {
     let place = tempfile::tempdir().unwrap();
     let directory = place.path().join("queue");
     let mut queue = Queue::open(&directory, LIMIT).unwrap();

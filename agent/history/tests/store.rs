@@ -93,7 +93,7 @@ fn files(directory: &Path) -> Vec<PathBuf> {
 }
 
 #[test]
-fn rows_are_there_at_both_resolutions_also_after_a_restart() {
+fn rows_exist_at_both_resolutions_after_a_restart() {
     let directory = tempfile::tempdir().unwrap();
     let store = filled(directory.path(), LIMIT, 1000..1075);
     let expected: Vec<_> = (60_001..=64_500).map(row).collect();
@@ -210,7 +210,7 @@ fn a_clock_that_was_some_minutes_ahead_hides_no_rows_of_the_right_time() {
 }
 
 #[test]
-fn the_first_write_creates_the_directory_for_its_owner_alone() {
+fn the_first_write_creates_the_directory_with_owner_only_permissions() {
     use std::os::unix::fs::PermissionsExt as _;
     let parent = tempfile::tempdir().unwrap();
     let directory = parent.path().join("history");
@@ -248,7 +248,7 @@ fn other_files_stay_untouched() {
 }
 
 #[test]
-fn a_link_in_place_of_a_file_is_not_followed() {
+fn a_symbolic_link_instead_of_a_file_is_not_followed() {
     let (directory, elsewhere) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
     drop(filled(elsewhere.path(), LIMIT, 0..3));
     let target = files(elsewhere.path()).remove(0);
@@ -286,7 +286,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(300))]
 
     #[test]
-    fn a_damaged_byte_costs_no_other_block_in_front_of_it(place: prop::sample::Index, value: u8) {
+    fn a_damaged_byte_invalidates_no_earlier_block(place: prop::sample::Index, value: u8) {
         let directory = tempfile::tempdir().unwrap();
         drop(filled(directory.path(), LIMIT, 0..3));
         let file = files(directory.path()).remove(0);

@@ -15,9 +15,9 @@ use crate::definition::{Element, Field, MessageType, Shape, Structure, TypeName}
 use crate::value::{Array, Items, Message, Scalar, ScalarKind, Scalars, Value};
 
 /// Size of the encapsulation header. XCDR aligns relative to the first byte after it.
-const ENCAPSULATION: usize = 4;
+const ENCAPSULATION_BYTES: usize = 4;
 /// Maximum number of padding bytes after the last field: RTPS aligns submessages to four bytes.
-const PADDING: usize = 3;
+const MAX_PADDING: usize = 3;
 
 /// Limits of one decoded message.
 #[derive(Debug, Clone, Copy)]
@@ -100,7 +100,7 @@ pub fn decode<'a>(
     limits: &Limits,
 ) -> Result<Decoded<'a>, DecodeError> {
     let (header, body) = payload
-        .split_first_chunk::<ENCAPSULATION>()
+        .split_first_chunk::<ENCAPSULATION_BYTES>()
         .ok_or(DecodeError::NoEncapsulation(payload.len()))?;
     let encoding = Encoding::parse(u16::from_be_bytes([header[0], header[1]]))?;
     let mut reader = Reader {
@@ -113,7 +113,7 @@ pub fn decode<'a>(
     let mut cursor = Cursor::new(body, encoding.endianness);
     let message = reader.message(&mut cursor, reader.structure(&message_type.root)?, 0)?;
     let trailing = cursor.remaining();
-    if trailing > PADDING {
+    if trailing > MAX_PADDING {
         reader.oddities.trailing = trailing;
     }
     Ok(Decoded {
@@ -494,8 +494,8 @@ fn within(cursor: &Cursor<'_>, length: usize, shape: Shape) -> Result<(), Decode
 /// Returns UTF-16 text; an invalid code unit counts as a character of its own. As in rclpy, a byte
 /// order mark at the beginning determines the byte order and is not part of the text.
 fn wide(units: &Scalars<'_>) -> String {
-    const MARK: u64 = 0xfeff;
-    const SWAPPED: u64 = 0xfffe;
+    const BYTE_ORDER_MARK: u64 = 0xfeff;
+    const SWAPPED_BYTE_ORDER_MARK: u64 = 0xfffe;
     let mut text = String::with_capacity(units.len());
     let mut pending = Vec::new();
     let flush = |pending: &mut Vec<u16>, text: &mut String| {
@@ -508,8 +508,8 @@ fn wide(units: &Scalars<'_>) -> String {
     });
     let mut is_swapped = false;
     for (place, unit) in units.enumerate() {
-        if place == 0 && matches!(unit, MARK | SWAPPED) {
-            is_swapped = unit == SWAPPED;
+        if place == 0 && matches!(unit, BYTE_ORDER_MARK | SWAPPED_BYTE_ORDER_MARK) {
+            is_swapped = unit == SWAPPED_BYTE_ORDER_MARK;
         } else if let Ok(unit) = u16::try_from(unit) {
             pending.push(if is_swapped { unit.swap_bytes() } else { unit });
         } else {

@@ -278,7 +278,7 @@ mod tests {
         let announced = format!("RIHS01_{}", "0".repeat(64));
         let failure = library(Dialect::Jazzy).find("std_msgs/msg/String", Some(&announced));
         let failure = failure.unwrap_err();
-        assert!(matches!(failure, NotFound::Another { .. }));
+        assert!(matches!(failure, NotFound::OtherDefinition { .. }));
         assert_eq!(
             failure.to_string(),
             format!(

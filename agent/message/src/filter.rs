@@ -184,7 +184,7 @@ enum Function {
 }
 
 impl Function {
-    const NAMES: [(&'static str, Self); 11] = [
+    const FUNCTION_NAMES: [(&'static str, Self); 11] = [
         ("abs", Self::Abs),
         ("all", Self::All),
         ("any", Self::Any),
@@ -199,7 +199,7 @@ impl Function {
     ];
 
     fn named(name: &str) -> Option<Self> {
-        Self::NAMES
+        Self::FUNCTION_NAMES
             .iter()
             .find(|(known, _)| *known == name)
             .map(|(_, function)| *function)

@@ -11,9 +11,9 @@ use crate::definition::{Element, MessageType, Shape, Structure};
 
 /// `type_description_interfaces/msg/FieldType`: offset of an array type's number from its
 /// element's.
-pub(crate) const ARRAY: u8 = 48;
-pub(crate) const BOUNDED: u8 = 96;
-pub(crate) const UNBOUNDED: u8 = 144;
+pub(crate) const ARRAY_OFFSET: u8 = 48;
+pub(crate) const BOUNDED_OFFSET: u8 = 96;
+pub(crate) const UNBOUNDED_OFFSET: u8 = 144;
 
 impl MessageType {
     /// Returns `RIHS01_` and 64 hexadecimal digits, as discovery announces it.
@@ -82,9 +82,9 @@ fn member(text: &mut String, name: &str, element: &Element, shape: Shape) {
     };
     let (offset, capacity) = match shape {
         Shape::Single => (0_u8, 0),
-        Shape::Array(size) => (ARRAY, size),
-        Shape::Bounded(size) => (BOUNDED, size),
-        Shape::Unbounded => (UNBOUNDED, 0),
+        Shape::Array(size) => (ARRAY_OFFSET, size),
+        Shape::Bounded(size) => (BOUNDED_OFFSET, size),
+        Shape::Unbounded => (UNBOUNDED_OFFSET, 0),
     };
     let _ = write!(
         text,

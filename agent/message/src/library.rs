@@ -29,14 +29,14 @@ use crate::library::search::Search;
 use crate::type_object::NotUsable;
 
 /// Directory of ROS installations, one subdirectory per distribution.
-const INSTALLED: &str = "/opt/ros";
+const ROS_PREFIX: &str = "/opt/ros";
 /// Maximum number of sources searched: a workspace installed package by package has hundreds.
 pub(super) const MAX_SOURCES: usize = 1024;
 /// Maximum number of cached types, and maximum size of their text in bytes.
 const MAX_KEPT: usize = 1024;
 const MAX_KEPT_TEXT: usize = 32 << 20;
 /// Prefix of type hashes of the only known version.
-const HASH: &str = "RIHS01_";
+const HASH_PREFIX: &str = "RIHS01_";
 
 /// Sources to search, in this order.
 #[derive(Debug, Clone, Default)]
@@ -64,7 +64,7 @@ impl Sources {
                     .collect()
             })
             .unwrap_or_default();
-        for prefix in installed(Path::new(INSTALLED), dialect) {
+        for prefix in installed(Path::new(ROS_PREFIX), dialect) {
             if !prefixes.contains(&prefix) {
                 prefixes.push(prefix);
             }
@@ -135,7 +135,7 @@ pub enum NotFound {
          --definitions",
         name.package()
     )]
-    Another {
+    OtherDefinition {
         /// Name of the type.
         name: TypeName,
         /// Source of the first definition found.
@@ -227,8 +227,8 @@ impl Library {
     }
 
     /// Returns the type of a name: with an announced RIHS01 hash, the first definition that matches
-    /// it; otherwise the first definition. With a hash of XTypes, only a type that nodes sent can be
-    /// compared: it is used if no file defines the type. Other hashes are ignored.
+    /// it; otherwise the first definition. With a hash of XTypes, only a type that nodes sent can
+    /// be compared: it is used if no file defines the type. Other hashes are ignored.
     pub fn find(
         &self,
         name: &str,
@@ -238,7 +238,7 @@ impl Library {
             .parse()
             .map_err(|_| NotFound::NotATypeName(name.to_owned()))?;
         let announced = announced_hash
-            .filter(|hash| hash.starts_with(HASH))
+            .filter(|hash| hash.starts_with(HASH_PREFIX))
             .map(str::to_owned);
         let equivalence = announced_hash.filter(|hash| EquivalenceHash::parse(hash).is_some());
         let key = (root, announced);
@@ -277,7 +277,7 @@ impl Library {
             Err(failure) => failure,
         };
         Err(match (failure, reason) {
-            (NotSent::Another(found), NotFound::Nowhere { .. }) => NotFound::Another {
+            (NotSent::Another(found), NotFound::Nowhere { .. }) => NotFound::OtherDefinition {
                 name: name.clone(),
                 location: "that a node described".to_owned(),
                 found,
@@ -418,7 +418,7 @@ mod tests {
     }
 
     #[test]
-    fn parts_come_from_another_source_if_only_then_the_hash_matches() {
+    fn nested_types_are_read_from_another_source_if_the_hash_matches() {
         let workspace = prefix(&[("w/msg/W.msg", "a/B b\nstd_msgs/Header header")]);
         let below = prefix(&[("a/msg/B.msg", "int8 x")]);
         let nodes = prefix(&[("a/msg/B.msg", "int16 x")]);
@@ -617,7 +617,10 @@ mod tests {
         let deep = NotClosed::TooDeep;
         assert!(matches!(failure, NotFound::Refused { reason, .. } if reason == deep));
         let failure = library.find("a/msg/T20", Some(&announced)).unwrap_err();
-        assert!(matches!(failure, NotFound::Another { .. }), "{failure}");
+        assert!(
+            matches!(failure, NotFound::OtherDefinition { .. }),
+            "{failure}"
+        );
         assert_eq!(
             library
                 .find("a/msg/T20", None)
@@ -642,7 +645,7 @@ mod tests {
     }
 
     #[test]
-    fn the_dialects_distribution_comes_first_then_the_others_newest_first() {
+    fn the_distribution_of_the_dialect_precedes_the_others_newest_first() {
         let here = tempfile::tempdir().unwrap();
         for name in ["humble", "iron", "jazzy", "rolling"] {
             fs::create_dir(here.path().join(name)).unwrap();

@@ -7,7 +7,7 @@ use ros2probe_wire::Endianness;
 use ros2probe_wire::cursor::{Cursor, WireError};
 
 /// Length of the encapsulation header (RTPS 2.5, 10.2).
-const ENCAPSULATION: usize = 4;
+const ENCAPSULATION_BYTES: usize = 4;
 /// Maximum width and height of a picture, in pixels.
 pub const MAX_SIDE: u32 = 320;
 /// Maximum number of points, and of poses.
@@ -85,7 +85,7 @@ pub enum PreviewError {
 /// How to read a message type.
 type Reader = fn(&mut Body<'_>) -> Result<Preview, PreviewError>;
 
-const READERS: [(&str, Reader); 9] = [
+const TYPE_READERS: [(&str, Reader); 9] = [
     ("sensor_msgs/msg/Image", image),
     ("sensor_msgs/msg/CompressedImage", compressed_image),
     ("sensor_msgs/msg/PointCloud2", point_cloud),
@@ -97,14 +97,14 @@ const READERS: [(&str, Reader); 9] = [
     ("geometry_msgs/msg/PoseWithCovarianceStamped", stamped_pose),
 ];
 
-/// Returns the preview of a payload with its encapsulation header; `None` for a type without one. The
-/// type has a ROS name.
+/// Returns the preview of a payload with its encapsulation header; `None` for a type without one.
+/// The type has a ROS name.
 ///
 /// # Errors
 ///
 /// Fails if the message is malformed or unsupported.
 pub fn preview(message_type: &str, payload: &[u8]) -> Result<Option<Preview>, PreviewError> {
-    let reader = READERS.iter().find(|(name, _)| *name == message_type);
+    let reader = TYPE_READERS.iter().find(|(name, _)| *name == message_type);
     let Some((_, read)) = reader else {
         return Ok(None);
     };
@@ -127,7 +127,7 @@ impl<'a> Body<'a> {
             [0, 7, ..] => (Endianness::Little, 4),
             _ => return Err(PreviewError::Encapsulation),
         };
-        let body = payload.get(ENCAPSULATION..).unwrap_or_default();
+        let body = payload.get(ENCAPSULATION_BYTES..).unwrap_or_default();
         Ok(Self {
             cursor: Cursor::new(body, endianness),
             wide,
@@ -371,7 +371,7 @@ fn laser_scan(body: &mut Body<'_>) -> Result<Preview, PreviewError> {
 
 fn occupancy_grid(body: &mut Body<'_>) -> Result<Preview, PreviewError> {
     /// Colour of a cell of which nothing is known.
-    const UNKNOWN: [u8; 3] = [150, 170, 180];
+    const UNKNOWN_COLOUR: [u8; 3] = [150, 170, 180];
     body.header()?;
     body.u32()?;
     body.u32()?;
@@ -386,7 +386,7 @@ fn occupancy_grid(body: &mut Body<'_>) -> Result<Preview, PreviewError> {
         let occupied = cell.cast_signed();
         Some(match u8::try_from(occupied) {
             Ok(percent) => [255 - (u16::from(percent.min(100)) * 255 / 100) as u8; 3],
-            Err(_) => UNKNOWN,
+            Err(_) => UNKNOWN_COLOUR,
         })
     });
     Ok(Preview::Picture(picture))
@@ -664,7 +664,7 @@ mod tests {
     proptest! {
         #[test]
         fn no_payload_makes_a_preview_large_or_panics(
-            (message_type, _) in proptest::sample::select(READERS.to_vec()), payload: Vec<u8>,
+            (message_type, _) in proptest::sample::select(TYPE_READERS.to_vec()), payload: Vec<u8>,
             kind in 0_u8..8,
         ) {
             let payload = [&[0, kind, 0, 0], &payload[..]].concat();

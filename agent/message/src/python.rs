@@ -32,12 +32,12 @@ pub fn repr(value: &Value<'_>) -> String {
 
 /// Returns `repr()` of a float.
 pub fn float(value: f64) -> String {
-    laid_out(value)
+    format_float(value)
 }
 
 /// Returns `str()` of a numpy `float32`: the digits that distinguish it from its neighbours.
 pub fn float32(value: f32) -> String {
-    laid_out(value)
+    format_float(value)
 }
 
 /// Returns `str()` of a scalar.
@@ -144,7 +144,7 @@ fn is_printable(character: char) -> bool {
 
 /// Formats a float as Python does: with an exponent below 1e-4 and from 1e16. The exponent has a
 /// sign and at least two digits.
-fn laid_out<T: LowerExp + FromStr + PartialEq + Copy>(value: T) -> String {
+fn format_float<T: LowerExp + FromStr + PartialEq + Copy>(value: T) -> String {
     let text = digits::scientific(value);
     let Some((mantissa, exponent)) = text.split_once('e') else {
         return text.to_ascii_lowercase();

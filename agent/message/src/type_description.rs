@@ -1,5 +1,5 @@
-//! Types as nodes describe them: the response of `type_description_interfaces/srv/GetTypeDescription`
-//! (ROS 2 Iron and later, REP-2016).
+//! Types as nodes describe them: the response of
+//! `type_description_interfaces/srv/GetTypeDescription` (ROS 2 Iron and later, REP-2016).
 //!
 //! A response holds the fields of a type and of its nested types. With `include_type_sources` it
 //! also holds their files. The files are used if they define the described type, because they have
@@ -16,7 +16,7 @@ use crate::definition::{
     Definition, Element, Field, MAX_TYPES, MessageType, NotClosed, Shape, Structure, TypeName,
 };
 use crate::dialect::Dialect;
-use crate::hash::{ARRAY, BOUNDED, UNBOUNDED};
+use crate::hash::{ARRAY_OFFSET, BOUNDED_OFFSET, UNBOUNDED_OFFSET};
 use crate::library::definition_source::DefinitionSource;
 use crate::library::search::Search;
 use crate::name::is_identifier;
@@ -26,9 +26,9 @@ use crate::value::{Array, Items, Message, Scalar, Value};
 pub const MAX_RESPONSE: usize = 256 << 10;
 /// Maximum number of values in a response.
 const MAX_VALUES: usize = 100_000;
-const RESPONSE: &str = "type_description_interfaces/srv/GetTypeDescription_Response";
+const RESPONSE_TYPE_NAME: &str = "type_description_interfaces/srv/GetTypeDescription_Response";
 /// Name of the member that rosidl adds to a type without fields.
-const PLACEHOLDER: &str = "structure_needs_at_least_one_member";
+const PLACEHOLDER_MEMBER: &str = "structure_needs_at_least_one_member";
 
 /// Why a response does not describe a usable type.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -68,7 +68,7 @@ pub enum NotDescribed {
 /// The type of a response, from the embedded definitions.
 static RESPONSE_TYPE: LazyLock<Option<MessageType>> = LazyLock::new(|| {
     let sources = [DefinitionSource::Embedded(Dialect::default())];
-    Search::new(&sources, &RESPONSE.parse().ok()?)
+    Search::new(&sources, &RESPONSE_TYPE_NAME.parse().ok()?)
         .run(None)
         .ok()
 });
@@ -170,7 +170,8 @@ fn structure(description: &Message<'_>) -> Result<Structure, NotDescribed> {
 /// Returns the structure with these fields, of which the placeholder of rosidl is none.
 pub(crate) fn structure_of(name: TypeName, mut fields: Vec<Field>) -> Structure {
     if let [only] = &*fields
-        && (&*only.name, &only.element, only.shape) == (PLACEHOLDER, &Element::UInt8, Shape::Single)
+        && (&*only.name, &only.element, only.shape)
+            == (PLACEHOLDER_MEMBER, &Element::UInt8, Shape::Single)
     {
         fields.clear();
     }
@@ -187,9 +188,11 @@ fn field(description: &Message<'_>) -> Result<Field, NotDescribed> {
     let id = number(described, "type_id")?;
     let size = || capacity(number(described, "capacity")?);
     let (base, shape) = match id {
-        _ if id > UNBOUNDED.into() => (id - u64::from(UNBOUNDED), Shape::Unbounded),
-        _ if id > BOUNDED.into() => (id - u64::from(BOUNDED), Shape::Bounded(size()?)),
-        _ if id > ARRAY.into() => (id - u64::from(ARRAY), Shape::Array(size()?)),
+        _ if id > UNBOUNDED_OFFSET.into() => (id - u64::from(UNBOUNDED_OFFSET), Shape::Unbounded),
+        _ if id > BOUNDED_OFFSET.into() => {
+            (id - u64::from(BOUNDED_OFFSET), Shape::Bounded(size()?))
+        }
+        _ if id > ARRAY_OFFSET.into() => (id - u64::from(ARRAY_OFFSET), Shape::Array(size()?)),
         _ => (id, Shape::Single),
     };
     let bound = || capacity(number(described, "string_capacity")?).map(Some);

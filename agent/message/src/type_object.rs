@@ -1,9 +1,9 @@
 //! Types as participants exchange them: TypeObjects, and the replies of the TypeLookup service that
 //! contain them (DDS-XTypes 1.3, 7.3.4 and 7.6.3.3).
 //!
-//! A TypeObject describes one type. It refers to others by their hash: the first 14 bytes of the MD5
-//! of their own TypeObject. A sender therefore cannot forge an object. Everything else in a reply is
-//! untrusted. Types that a `.msg` file cannot define are refused by name.
+//! A TypeObject describes one type. It refers to others by their hash: the first 14 bytes of the
+//! MD5 of their own TypeObject. A sender therefore cannot forge an object. Everything else in a
+//! reply is untrusted. Types that a `.msg` file cannot define are refused by name.
 
 mod assembly;
 
@@ -32,7 +32,8 @@ const REQUEST_IDENTITY: usize = 24;
 /// Discriminator of a TypeIdentifier or TypeObject of a minimal and of a complete type.
 const EK_MINIMAL: u8 = 0xf1;
 const EK_COMPLETE: u8 = 0xf2;
-/// `TypeLookup_getTypes_HashId`, and the identifier of the member `types`: from the MD5 of the names.
+/// `TypeLookup_getTypes_HashId`, and the identifier of the member `types`: from the MD5 of the
+/// names.
 const GET_TYPES: u32 = 0x0182_52d3;
 const TYPES: u32 = 0x0280_4ad1;
 /// Bits of a structure's flags.
@@ -361,7 +362,7 @@ fn identifier(cursor: &mut Cursor<'_>, depth: usize) -> Result<Reference, NotUsa
                 0x80 => bound(cursor, is_large)?.map_or(Shape::Unbounded, Shape::Bounded),
                 _ => Shape::Array(dimensions(cursor, is_large)?),
             };
-            return identifier(cursor, depth + 1)?.within(shape);
+            return identifier(cursor, depth + 1)?.in_collection(shape);
         }
         EK_COMPLETE => Target::Type(EquivalenceHash(cursor.array("equivalence_hash")?)),
         EK_MINIMAL => return Err(NotUsable::Kind("a minimal type")),
@@ -409,7 +410,7 @@ fn product(one: u32, other: u32) -> Result<u32, NotUsable> {
 
 impl Reference {
     /// Returns a collection of this. Arrays of arrays are one array on the wire.
-    fn within(self, shape: Shape) -> Result<Self, NotUsable> {
+    fn in_collection(self, shape: Shape) -> Result<Self, NotUsable> {
         let shape = match (shape, self.shape) {
             (shape, Shape::Single) | (Shape::Single, shape) => shape,
             (Shape::Array(outer), Shape::Array(inner)) => Shape::Array(product(outer, inner)?),

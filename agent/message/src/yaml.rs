@@ -13,9 +13,9 @@ use crate::truncation::Truncation;
 use crate::value::{Array, Items, Message, Scalar, Value};
 
 /// Spaces per level.
-const STEP: usize = 2;
+const INDENT_STEP: usize = 2;
 /// Characters that end a line in YAML 1.1.
-const BREAKS: [char; 4] = ['\n', '\u{85}', '\u{2028}', '\u{2029}'];
+const LINE_BREAKS: [char; 4] = ['\n', '\u{85}', '\u{2028}', '\u{2029}'];
 
 /// Style of sequences. Mappings outside of sequences are always in block style: PyYAML has no style
 /// for the ordered mappings that represent messages.
@@ -58,12 +58,12 @@ impl Writer<'_> {
             if index > 0 || !behind_dash {
                 self.indent(indent);
             }
-            self.string(&field.name, indent + STEP);
+            self.string(&field.name, indent + INDENT_STEP);
             self.text.push(':');
             match value {
                 Value::Message(inner) if !inner.values.is_empty() => {
                     self.text.push('\n');
-                    self.block(inner, indent + STEP, false);
+                    self.block(inner, indent + INDENT_STEP, false);
                 }
                 Value::Array(array)
                     if array.length > 0 && !self.shown.no_arrays && self.style == Style::Block =>
@@ -73,7 +73,7 @@ impl Writer<'_> {
                 }
                 _ => {
                     self.text.push(' ');
-                    self.inline(value, indent + STEP);
+                    self.inline(value, indent + INDENT_STEP);
                     self.text.push('\n');
                 }
             }
@@ -93,28 +93,28 @@ impl Writer<'_> {
                     if message.values.is_empty() {
                         self.text.push_str("{}\n");
                     } else {
-                        self.block(message, indent + STEP, true);
+                        self.block(message, indent + INDENT_STEP, true);
                     }
                 }
             }
             Items::Texts(texts) => {
                 for text in texts.iter().take(count) {
                     dash(self);
-                    self.shown_string(text, indent + STEP);
+                    self.shown_string(text, indent + INDENT_STEP);
                     self.text.push('\n');
                 }
             }
             Items::Scalars(scalars) => {
                 for value in scalars.iter().take(count) {
                     dash(self);
-                    self.scalar(value, indent + STEP);
+                    self.scalar(value, indent + INDENT_STEP);
                     self.text.push('\n');
                 }
             }
         }
         if cut {
             dash(self);
-            self.string("...", indent + STEP);
+            self.string("...", indent + INDENT_STEP);
             self.text.push('\n');
         }
     }
@@ -125,9 +125,9 @@ impl Writer<'_> {
             if index > 0 {
                 self.text.push_str(", ");
             }
-            self.string(&field.name, indent + STEP);
+            self.string(&field.name, indent + INDENT_STEP);
             self.text.push_str(": ");
-            self.inline(value, indent + STEP);
+            self.inline(value, indent + INDENT_STEP);
         }
         self.text.push('}');
     }
@@ -146,25 +146,25 @@ impl Writer<'_> {
             Items::Messages(messages) => {
                 for message in messages.iter().take(count) {
                     separate(self);
-                    self.flow(message, indent + STEP);
+                    self.flow(message, indent + INDENT_STEP);
                 }
             }
             Items::Texts(texts) => {
                 for text in texts.iter().take(count) {
                     separate(self);
-                    self.shown_string(text, indent + STEP);
+                    self.shown_string(text, indent + INDENT_STEP);
                 }
             }
             Items::Scalars(scalars) => {
                 for value in scalars.iter().take(count) {
                     separate(self);
-                    self.scalar(value, indent + STEP);
+                    self.scalar(value, indent + INDENT_STEP);
                 }
             }
         }
         if cut {
             separate(self);
-            self.string("...", indent + STEP);
+            self.string("...", indent + INDENT_STEP);
         }
         self.text.push(']');
         self.is_in_flow = outside;
@@ -221,7 +221,7 @@ impl Writer<'_> {
         } else {
             forms.block_plain
         };
-        if plain && !text.is_empty() && !reads_as_other(text) {
+        if plain && !text.is_empty() && !is_other_type(text) {
             self.text.push_str(text);
         } else if forms.single_quoted {
             self.single_quoted(text, indent);
@@ -236,7 +236,7 @@ impl Writer<'_> {
         self.text.push('\'');
         let mut in_breaks = false;
         for character in text.chars() {
-            if BREAKS.contains(&character) {
+            if LINE_BREAKS.contains(&character) {
                 if !in_breaks && character == '\n' {
                     self.text.push('\n');
                 }
@@ -250,7 +250,7 @@ impl Writer<'_> {
                     self.text.push('\'');
                 }
             }
-            in_breaks = BREAKS.contains(&character);
+            in_breaks = LINE_BREAKS.contains(&character);
         }
         if in_breaks {
             self.indent(indent);
@@ -322,8 +322,8 @@ fn float(number: f64) -> String {
 }
 
 /// Returns whether the plain text would be read as a number, boolean, null or time.
-fn reads_as_other(text: &str) -> bool {
-    static OTHER: LazyLock<Option<Regex>> = LazyLock::new(|| {
+fn is_other_type(text: &str) -> bool {
+    static OTHER_TYPE_PATTERN: LazyLock<Option<Regex>> = LazyLock::new(|| {
         let float =
             r"[-+]?[0-9][0-9_]*\.[0-9_]*(?:[eE][-+][0-9]+)?|\.[0-9][0-9_]*(?:[eE][-+][0-9]+)?";
         let other_float =
@@ -333,9 +333,9 @@ fn reads_as_other(text: &str) -> bool {
         Regex::new(&format!("^(?:{float}|{other_float}|{integer}|{time})$")).ok()
     });
     match text.as_bytes().first() {
-        Some(b'0'..=b'9' | b'-' | b'+' | b'.') => {
-            OTHER.as_ref().is_none_or(|regex| regex.is_match(text))
-        }
+        Some(b'0'..=b'9' | b'-' | b'+' | b'.') => OTHER_TYPE_PATTERN
+            .as_ref()
+            .is_none_or(|regex| regex.is_match(text)),
         Some(b'y' | b'Y' | b'n' | b'N' | b't' | b'T' | b'f' | b'F' | b'o' | b'O') => {
             let lower = text.to_ascii_lowercase();
             let word =
@@ -363,7 +363,7 @@ impl Forms {
     fn of(text: &str) -> Self {
         let blank = |character: Option<&char>| {
             character.is_none_or(|character| {
-                matches!(character, '\0' | ' ' | '\t' | '\r') || BREAKS.contains(character)
+                matches!(character, '\0' | ' ' | '\t' | '\r') || LINE_BREAKS.contains(character)
             })
         };
         let document = text.starts_with("---") || text.starts_with("...");
@@ -387,19 +387,19 @@ impl Forms {
                 ('#', Some(_)) if blank(previous.as_ref()) => (block, flow) = (true, true),
                 _ => {}
             }
-            broken |= BREAKS.contains(&character);
+            broken |= LINE_BREAKS.contains(&character);
             special |= !matches!(
                 character,
                 '\n' | ' '..='~' | '\u{85}' | '\u{a0}'..='\u{d7ff}' | '\u{e000}'..='\u{fefe}'
                     | '\u{ff00}'..='\u{fffd}' | '\u{10000}'..='\u{10fffe}'
             );
-            let after_break = previous.is_some_and(|previous| BREAKS.contains(&previous));
+            let after_break = previous.is_some_and(|previous| LINE_BREAKS.contains(&previous));
             break_space |= character == ' ' && after_break;
-            space_break |= BREAKS.contains(&character) && previous == Some(' ');
+            space_break |= LINE_BREAKS.contains(&character) && previous == Some(' ');
             previous = Some(character);
         }
         let edge = |character: Option<char>| {
-            character.is_some_and(|character| character == ' ' || BREAKS.contains(&character))
+            character.is_some_and(|character| character == ' ' || LINE_BREAKS.contains(&character))
         };
         let edges = edge(text.chars().next()) || edge(previous);
         let only_double = special || space_break;

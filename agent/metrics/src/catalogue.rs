@@ -701,7 +701,7 @@ mod tests {
     }
 
     #[test]
-    fn a_family_name_lacks_the_suffix_of_its_samples() {
+    fn a_family_name_omits_the_suffix_of_its_samples() {
         assert_eq!(TOPIC_BYTES.family(), "ros2_topic_bytes");
         assert_eq!(TOPIC_MESSAGES.family(), "ros2_topic_messages");
         assert_eq!(

@@ -18,7 +18,7 @@ pub struct Definition {
     /// Severity of the event.
     pub severity: Severity,
     /// Severity if the event reports the end of a condition or an intended change.
-    pub relief: Severity,
+    pub resolved_severity: Severity,
     /// Attributes in order; unknown ones are left out.
     pub attributes: &'static [&'static str],
     /// One sentence of help.
@@ -124,7 +124,7 @@ impl Definition {
         Self {
             name,
             severity,
-            relief: severity,
+            resolved_severity: severity,
             attributes,
             help,
             stability: Stability::Stable,
@@ -133,8 +133,11 @@ impl Definition {
 
     /// Sets the severity of events that report the end of a condition or an intended change.
     #[must_use]
-    pub const fn relief(self, relief: Severity) -> Self {
-        Self { relief, ..self }
+    pub const fn resolved_severity(self, relief: Severity) -> Self {
+        Self {
+            resolved_severity: relief,
+            ..self
+        }
     }
 }
 

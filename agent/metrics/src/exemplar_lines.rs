@@ -13,10 +13,10 @@ use crate::catalogue::{CHAIN_LATENCY, HOP_LATENCY};
 use ros2probe_model::derive::chain::exemplar::{Exemplar, Exemplars};
 
 /// Families whose histograms have exemplars.
-const FAMILIES: [&str; 2] = [CHAIN_LATENCY.name, HOP_LATENCY.name];
-const NANOSECONDS: u64 = 1_000_000_000;
+const EXEMPLAR_FAMILIES: [&str; 2] = [CHAIN_LATENCY.name, HOP_LATENCY.name];
+const NANOSECONDS_PER_SECOND: u64 = 1_000_000_000;
 
-/// Exemplars of the histograms of [`FAMILIES`] whose lines are not written yet, in order.
+/// Exemplars of the histograms of [`EXEMPLAR_FAMILIES`] whose lines are not written yet, in order.
 #[derive(Debug, Default)]
 pub(crate) struct Waiting(Mutex<VecDeque<(Exemplars, usize)>>);
 
@@ -57,7 +57,7 @@ impl<'a, W: Write> ExemplarLines<'a, W> {
             let rest = line.strip_prefix(family);
             rest.is_some_and(|rest| rest.starts_with("_bucket{"))
         };
-        let is_bucket = FAMILIES.into_iter().any(is_bucket);
+        let is_bucket = EXEMPLAR_FAMILIES.into_iter().any(is_bucket);
         let Some(exemplar) = is_bucket.then(|| self.waiting.next()).flatten() else {
             return self.page.write_str(line);
         };
@@ -67,8 +67,8 @@ impl<'a, W: Write> ExemplarLines<'a, W> {
             "{} # {{trace_id=\"{trace_id:032x}\"}} {} {}.{:09}",
             line.trim_end_matches('\n'),
             exemplar.seconds,
-            at / NANOSECONDS,
-            at % NANOSECONDS
+            at / NANOSECONDS_PER_SECOND,
+            at % NANOSECONDS_PER_SECOND
         )
     }
 }

@@ -9,7 +9,7 @@ use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 
 /// Maximum time to stop, whatever the receiver does.
-const ENDING: Duration = Duration::from_secs(2);
+const STOP_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Starts a thread with only the privileges of exports, and returns after all other privileges are
 /// dropped.
@@ -53,7 +53,7 @@ impl ExportThread {
     /// Exports a last time and stops, within two seconds.
     pub async fn finish(self) {
         self.stop();
-        if timeout(ENDING, self.ended).await.is_err() {
+        if timeout(STOP_TIMEOUT, self.ended).await.is_err() {
             tracing::warn!("the last export did not end in time");
         } else if self.thread.join().is_err() {
             tracing::error!("the exporting thread panicked");

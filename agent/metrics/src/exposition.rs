@@ -59,7 +59,8 @@ impl Format {
                     match parameter.split_once('=') {
                         Some(("q", value)) => weight = value.parse().unwrap_or(0.0),
                         Some(("version", version))
-                            if media == OPENMETRICS && !["1.0.0", "0.0.1"].contains(&version) =>
+                            if media == OPENMETRICS_TYPE
+                                && !["1.0.0", "0.0.1"].contains(&version) =>
                         {
                             return None;
                         }
@@ -70,7 +71,7 @@ impl Format {
             });
             offers.fold(0.0_f32, f32::max)
         };
-        let openmetrics = quality(|media| media == OPENMETRICS);
+        let openmetrics = quality(|media| media == OPENMETRICS_TYPE);
         let classic = quality(|media| media == "text/plain");
         if openmetrics > 0.0 && openmetrics >= classic {
             Self::OpenMetrics
@@ -89,7 +90,7 @@ impl Format {
     }
 }
 
-const OPENMETRICS: &str = "application/openmetrics-text";
+const OPENMETRICS_TYPE: &str = "application/openmetrics-text";
 
 impl Exposition {
     /// Creates an exposition of this source.

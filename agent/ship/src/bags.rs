@@ -18,11 +18,11 @@ pub(crate) const MAX_BAGS: usize = 10_000;
 /// Maximum number of files of a bag.
 const MAX_FILES: usize = 10_000;
 /// Time for which a bag without a lock must be unchanged, if its files are complete.
-const SETTLED: Duration = Duration::from_secs(2);
+const QUIET_TIME: Duration = Duration::from_secs(2);
 /// The same of a bag with an incomplete file: other recorders hold no lock.
-const ABANDONED: Duration = Duration::from_mins(1);
+const INCOMPLETE_QUIET_TIME: Duration = Duration::from_mins(1);
 /// Key of a snapshot's trigger in the custom data of a bag.
-const TRIGGER: &str = "ros2probe_trigger";
+const TRIGGER_KEY: &str = "ros2probe_trigger";
 
 /// State of the files of a bag: names, sizes, and times of the last change.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -178,8 +178,8 @@ impl Scanner {
                 since: Instant::now(),
             });
             let quiet = match now.content.is_complete {
-                true => SETTLED,
-                false => ABANDONED,
+                true => QUIET_TIME,
+                false => INCOMPLETE_QUIET_TIME,
             };
             if lock::is_held(&path) || !is_quiet(&now, quiet) {
                 found.unfinished.push(name.clone());
@@ -232,7 +232,7 @@ impl Content {
             let is_plain = name.ends_with(".mcap");
             !is_plain || listed(name) && is_ended(&bag.join(name))
         });
-        let trigger = metadata.custom_data.get(TRIGGER);
+        let trigger = metadata.custom_data.get(TRIGGER_KEY);
         let start = metadata.starting_time;
         let has_times = metadata.message_count > 0 && start != metadata::NO_START;
         Self {
@@ -274,7 +274,7 @@ mod tests {
         let mut options = Options::default();
         if trigger {
             let data = "{\"snapshot\":\"s\",\"trigger\":\"request\"}".to_owned();
-            options.custom_data.insert(TRIGGER.to_owned(), data);
+            options.custom_data.insert(TRIGGER_KEY.to_owned(), data);
         }
         Writer::create(&root.join(name), options).unwrap()
     }
@@ -293,7 +293,7 @@ mod tests {
     }
 
     #[test]
-    fn triggered_bags_come_first_and_then_the_oldest_ones() {
+    fn triggered_bags_are_sorted_before_the_oldest_bags() {
         let directory = tempfile::tempdir().unwrap();
         let root = directory.path();
         for (name, trigger, seconds) in [
@@ -336,7 +336,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bag_that_was_just_changed_or_lacks_a_file_is_no_complete_one() {
+    fn a_bag_that_just_changed_or_misses_a_file_is_incomplete() {
         let directory = tempfile::tempdir().unwrap();
         let root = directory.path();
         write(root, "lap", false).close(BTreeMap::new()).unwrap();

@@ -91,11 +91,11 @@ impl Shipper {
                 if self.is_interrupted(bag) {
                     return Ok(Step::Interrupted);
                 }
-                self.store()?.renew()?;
+                self.store()?.reload_credentials()?;
                 let sent = self.send(bag, &mut delivery, index).await;
                 self.records.keep(&bag.name, delivery.clone());
                 sent?;
-                self.progressed(bag, &delivery);
+                self.show_progress(bag, &delivery);
             }
         }
         if Fingerprint::of(&bag.path).ok().as_ref() != Some(&bag.fingerprint) {
@@ -223,7 +223,7 @@ impl Shipper {
                 false => Err(StoreError::Missing(None).into()),
             };
         }
-        if !store.resumes() {
+        if !store.is_resumable() {
             send_to_folder(store, &path, &source, file.bytes).await?;
         } else if file.bytes <= PART_BYTES {
             let content = read_part(&source, 0, file.bytes)?;

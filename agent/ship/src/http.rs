@@ -32,11 +32,11 @@ use crate::link::{Link, PIECE_BYTES};
 use crate::settings::SettingsError;
 
 /// Maximum wait for a connection.
-const CONNECT: Duration = Duration::from_secs(20);
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(20);
 /// Time after which the kernel ends a connection whose other end confirms nothing.
-const UNCONFIRMED: Duration = Duration::from_mins(1);
+const TCP_USER_TIMEOUT: Duration = Duration::from_mins(1);
 /// Maximum wait for an answer after the last bytes.
-const ANSWER: Duration = Duration::from_mins(2);
+const RESPONSE_TIMEOUT: Duration = Duration::from_mins(2);
 /// Maximum length of an answer in bytes. Only manifests and short documents are read.
 const ANSWER_BYTES: usize = 16 << 20;
 
@@ -76,9 +76,9 @@ impl Connections {
     ) -> Result<Self, SettingsError> {
         let mut tcp = TcpConnector::new();
         tcp.enforce_http(false);
-        tcp.set_connect_timeout(Some(CONNECT));
-        tcp.set_tcp_user_timeout(Some(UNCONFIRMED));
-        tcp.set_keepalive(Some(UNCONFIRMED / 2));
+        tcp.set_connect_timeout(Some(CONNECT_TIMEOUT));
+        tcp.set_tcp_user_timeout(Some(TCP_USER_TIMEOUT));
+        tcp.set_keepalive(Some(TCP_USER_TIMEOUT / 2));
         let connector = HttpsConnectorBuilder::new()
             .with_tls_config(tls(ca_file, is_secure)?)
             .https_or_http()
@@ -91,7 +91,7 @@ impl Connections {
     /// Completes when the request has had no progress for too long.
     async fn stalled(&self) {
         loop {
-            let deadline = self.link.progress() + ANSWER;
+            let deadline = self.link.progress() + RESPONSE_TIMEOUT;
             if deadline <= Instant::now() {
                 return;
             }
@@ -142,7 +142,7 @@ impl HttpService for Connections {
             self.link
                 .refused(head.status, pause.map(Duration::from_secs));
         }
-        let body = timeout(ANSWER, Limited::new(body, ANSWER_BYTES).collect()).await;
+        let body = timeout(RESPONSE_TIMEOUT, Limited::new(body, ANSWER_BYTES).collect()).await;
         let body = body.map_err(|_| HttpError::new(HttpErrorKind::Timeout, Slow))?;
         let body = body.map_err(|error| HttpError::new(HttpErrorKind::Decode, BadAnswer(error)))?;
         let body = Full::new(body.to_bytes()).map_err(|never| match never {});
@@ -169,7 +169,7 @@ impl Body for Paced {
         }
         let length = self.rest.len().min(PIECE_BYTES);
         if self.turn.is_none() {
-            self.turn = Some(Box::pin(sleep_until(self.link.turn(length))));
+            self.turn = Some(Box::pin(sleep_until(self.link.reserve(length))));
         }
         if let Some(turn) = &mut self.turn
             && turn.as_mut().poll(context).is_pending()

@@ -31,6 +31,6 @@ mod windows;
 pub use manifest::{Manifest, ManifestFile};
 pub use settings::{Settings, SettingsError, SpaceLimits, is_destination};
 pub use shipper::{Findings, Observer, ShipError, Shipper};
-pub use state::{DIRECTORY, is_delivered};
+pub use state::{RECORDS_DIRECTORY, is_delivered};
 pub use status::{Delivered, Failure, Status, Uploading};
 pub use windows::{InvalidWindow, Window, Windows};

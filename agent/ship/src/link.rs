@@ -53,7 +53,7 @@ impl Link {
     }
 
     /// Takes a turn for bytes, and returns the time from which they may be sent.
-    pub(crate) fn turn(&self, bytes: usize) -> Instant {
+    pub(crate) fn reserve(&self, bytes: usize) -> Instant {
         let mut state = self.state();
         let now = Instant::now();
         let turn = state.next.max(now);
@@ -92,17 +92,17 @@ mod tests {
     use super::*;
 
     #[tokio::test]
-    async fn bytes_take_turns_at_the_configured_rate() {
+    async fn sending_is_limited_to_the_configured_rate() {
         let link = Link::new(Some(100_000));
         let begun = Instant::now();
-        let turns: Vec<_> = (0..11).map(|_| link.turn(10_000)).collect();
+        let turns: Vec<_> = (0..11).map(|_| link.reserve(10_000)).collect();
         assert!(turns[0] < begun + Duration::from_millis(50));
         let whole = turns[10] - turns[0];
         assert!(whole >= Duration::from_millis(950), "{whole:?}");
         assert!(whole <= Duration::from_millis(1_050), "{whole:?}");
         let unlimited = Link::new(None);
-        unlimited.turn(1 << 30);
-        assert!(unlimited.turn(1) < Instant::now() + Duration::from_millis(50));
+        unlimited.reserve(1 << 30);
+        assert!(unlimited.reserve(1) < Instant::now() + Duration::from_millis(50));
     }
 
     #[tokio::test]

@@ -21,14 +21,14 @@ use crate::status::{Delivered, Failure, MAX_LISTED, Status, Uploading, now};
 use crate::store::Store;
 
 /// Time between two scans of the directory.
-const POLL: Duration = Duration::from_secs(2);
+const SCAN_INTERVAL: Duration = Duration::from_secs(2);
 /// Pauses after a failure.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
 const LONGEST_PAUSE: Duration = Duration::from_mins(1);
 /// Number of failures in a row after which a single pass ends.
 const MAX_FAILURES: u32 = 3;
 /// Beginning of the name of a bag that is being deleted.
-const DELETED: &str = ".delivered-";
+const DELETED_PREFIX: &str = ".delivered-";
 
 /// Returns warnings and errors of the agent between two times in nanoseconds since 1970; `None` if
 /// the agent cannot be queried.
@@ -56,7 +56,7 @@ pub struct Shipper {
     /// Reason of the last failure that was logged; `None` after a success.
     logged: Option<String>,
     /// Whether windows are ignored.
-    is_single: bool,
+    ignores_windows: bool,
     last_scan: Option<Instant>,
     found: Found,
 }
@@ -121,7 +121,7 @@ impl Shipper {
             failures: BTreeMap::new(),
             failures_in_row: 0,
             logged: None,
-            is_single: false,
+            ignores_windows: false,
             last_scan: None,
             found: Found::default(),
             settings,
@@ -134,11 +134,11 @@ impl Shipper {
     /// Never fails: failures are logged, and the delivery is repeated.
     pub async fn run(&mut self) -> Result<(), ShipError> {
         loop {
-            let wait = match self.turn().await {
+            let wait = match self.deliver_step().await {
                 Ok(wait) => wait,
                 Err(error) => {
                     self.log_failure("", &describe(&error));
-                    Some(POLL)
+                    Some(SCAN_INTERVAL)
                 }
             };
             if let Some(wait) = wait {
@@ -152,10 +152,10 @@ impl Shipper {
     /// # Errors
     /// Fails if a bag waits after some attempts, or if the directory cannot be read.
     pub async fn run_once(&mut self) -> Result<Status, ShipError> {
-        self.is_single = true;
+        self.ignores_windows = true;
         self.scan()?;
         loop {
-            let wait = self.turn().await?;
+            let wait = self.deliver_step().await?;
             let waiting = self.waiting().len();
             if waiting == 0 {
                 return Ok(self.status.clone());
@@ -175,13 +175,13 @@ impl Shipper {
     }
 
     /// Delivers one bag as far as possible. Returns a time to wait, if there is a reason.
-    async fn turn(&mut self) -> Result<Option<Duration>, ShipError> {
+    async fn deliver_step(&mut self) -> Result<Option<Duration>, ShipError> {
         self.scan()?;
         self.drop_vanished().await;
         self.make_space().await;
         let Some(bag) = self.next() else {
             self.show_status();
-            return Ok(Some(POLL));
+            return Ok(Some(SCAN_INTERVAL));
         };
         let delivered = self.deliver(&bag).await;
         self.status.uploading = None;
@@ -239,11 +239,11 @@ impl Shipper {
     /// Returns whether the bag may be delivered at this time.
     fn is_permitted(&self, bag: &Bag) -> bool {
         let is_urgent = bag.is_triggered() && self.settings.triggered_always;
-        self.is_single || is_urgent || self.opens_in().is_zero()
+        self.ignores_windows || is_urgent || self.time_to_window().is_zero()
     }
 
-    fn opens_in(&self) -> Duration {
-        self.settings.windows.opens_in(Zoned::now().time())
+    fn time_to_window(&self) -> Duration {
+        self.settings.windows.time_to_opening(Zoned::now().time())
     }
 
     /// Returns whether the delivery of a bag ends for now: the window closed, or a triggered bag
@@ -252,7 +252,9 @@ impl Shipper {
         if !self.is_permitted(bag) {
             return true;
         }
-        let is_due = self.last_scan.is_none_or(|scan| scan.elapsed() >= POLL);
+        let is_due = self
+            .last_scan
+            .is_none_or(|scan| scan.elapsed() >= SCAN_INTERVAL);
         if bag.is_triggered() || !is_due || self.scan().is_err() {
             return false;
         }
@@ -304,7 +306,7 @@ impl Shipper {
                 Ok(false) => {
                     let name = &bag.name;
                     tracing::warn!(bag = %name, "the destination no longer has a delivered bag: it is delivered again");
-                    again(&mut delivery);
+                    restart_delivery(&mut delivery);
                     self.records.keep(&bag.name, delivery);
                     return;
                 }
@@ -316,7 +318,7 @@ impl Shipper {
             let aside = self
                 .settings
                 .recordings
-                .join(format!("{DELETED}{}", bag.name));
+                .join(format!("{DELETED_PREFIX}{}", bag.name));
             // After a loss of power, a bag is there as a whole or not at all.
             let removed = fs::rename(&bag.path, &aside).and_then(|()| fs::remove_dir_all(&aside));
             if let Err(error) = removed {
@@ -336,7 +338,11 @@ impl Shipper {
             .into_iter()
             .flatten();
         for entry in entries.flatten() {
-            if entry.file_name().to_string_lossy().starts_with(DELETED) {
+            if entry
+                .file_name()
+                .to_string_lossy()
+                .starts_with(DELETED_PREFIX)
+            {
                 let _ = fs::remove_dir_all(entry.path());
             }
         }
@@ -402,7 +408,7 @@ impl Shipper {
     }
 
     /// Shows a delivery after a successful step of it.
-    pub(crate) fn progressed(&mut self, bag: &Bag, delivery: &Delivery) {
+    pub(crate) fn show_progress(&mut self, bag: &Bag, delivery: &Delivery) {
         let (bytes, done_bytes) = delivery.progress();
         let uploading = Uploading {
             bag: bag.name.clone(),
@@ -429,13 +435,13 @@ impl Shipper {
         self.status.waiting_bags = bags;
         self.status.waiting_bytes = bytes;
         self.status.unfinished_bags = self.found.unfinished.len() as u64;
-        self.status.opens_in_seconds = self.opens_in().as_secs();
+        self.status.opens_in_seconds = self.time_to_window().as_secs();
         self.status.write(&self.settings.state);
     }
 }
 
 /// Makes a delivery begin again.
-fn again(delivery: &mut Delivery) {
+fn restart_delivery(delivery: &mut Delivery) {
     delivery.is_delivered = false;
     for file in &mut delivery.files {
         file.is_sent = false;

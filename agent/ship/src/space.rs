@@ -17,13 +17,13 @@ struct Space {
 /// free, or all bags together take nine tenths of their limit.
 pub(crate) fn is_needed(directory: &Path, limits: SpaceLimits) -> bool {
     let space = space(directory);
-    space.is_ok_and(|space| lacks(space, limits))
+    space.is_ok_and(|space| is_space_low(space, limits))
         || limits
             .max_total_bytes
             .is_some_and(|limit| used(directory) >= limit - limit / 10)
 }
 
-fn lacks(space: Space, limits: SpaceLimits) -> bool {
+fn is_space_low(space: Space, limits: SpaceLimits) -> bool {
     let part = space.size / 100 * u64::from(limits.reserve_percent);
     let reserve = part.max(limits.reserve_bytes);
     reserve > 0 && space.free < reserve.saturating_mul(2)
@@ -57,7 +57,7 @@ mod tests {
             reserve_bytes: 60,
             max_total_bytes: None,
         };
-        let lacks = |size, free, limits| lacks(Space { size, free }, limits);
+        let lacks = |size, free, limits| is_space_low(Space { size, free }, limits);
         assert!(lacks(1_000, 119, limits));
         assert!(!lacks(1_000, 120, limits));
         assert!(lacks(10_000, 999, limits), "5 % are more than 60 bytes");

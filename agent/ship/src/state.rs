@@ -12,12 +12,12 @@ use serde::{Deserialize, Serialize};
 use crate::bags::{Fingerprint, MAX_BAGS};
 
 /// Name of the directory of records, below the state directory of the agent.
-pub const DIRECTORY: &str = "ship";
+pub const RECORDS_DIRECTORY: &str = "ship";
 /// Endings of the names of records and receipts.
-const RECORD: &str = "json";
-const RECEIPT: &str = "receipt";
+const RECORD_EXTENSION: &str = "json";
+const RECEIPT_EXTENSION: &str = "receipt";
 /// Directories of records and receipts, so that no bag's name is that of another file.
-const BAGS: &str = "bags";
+const BAGS_DIRECTORY: &str = "bags";
 /// Maximum size of a record, in bytes.
 const RECORD_BYTES: u64 = 16 << 20;
 
@@ -99,7 +99,7 @@ impl Records {
     /// Opens the records, and creates their directory.
     pub(crate) fn open(directory: &Path) -> Result<Self, RecordsError> {
         let wrong = |error| RecordsError::Directory(directory.to_owned(), error);
-        let bags = directory.join(BAGS);
+        let bags = directory.join(BAGS_DIRECTORY);
         let mut builder = DirBuilder::new();
         match builder.recursive(true).mode(0o750).create(&bags) {
             // Deliveries make space, so they begin without records.
@@ -118,7 +118,7 @@ impl Records {
         let mut records = Self::empty(directory, Some(lock));
         for entry in fs::read_dir(&bags).map_err(wrong)?.take(2 * MAX_BAGS) {
             let path = entry.map_err(wrong)?.path();
-            let is_record = path.extension().is_some_and(|end| end == RECORD);
+            let is_record = path.extension().is_some_and(|end| end == RECORD_EXTENSION);
             let name = path.file_stem().and_then(|name| name.to_str());
             // A damaged record is as none: the bag is compared with the destination.
             if let Some(name) = name.filter(|_| is_record)
@@ -149,8 +149,8 @@ impl Records {
 
     /// Keeps a record. If the disk is full, it is kept in memory.
     pub(crate) fn keep(&mut self, bag: &str, delivery: Delivery) {
-        let written = write_json(&self.path(bag, RECORD), &delivery).and_then(|()| {
-            let receipt = self.path(bag, RECEIPT);
+        let written = write_json(&self.path(bag, RECORD_EXTENSION), &delivery).and_then(|()| {
+            let receipt = self.path(bag, RECEIPT_EXTENSION);
             match delivery.is_delivered {
                 true => write(&receipt, delivery.fingerprint.text().as_bytes()),
                 false => remove(&receipt),
@@ -165,14 +165,16 @@ impl Records {
 
     /// Forgets a bag, and returns its record.
     pub(crate) fn forget(&mut self, bag: &str) -> Option<Delivery> {
-        for ending in [RECEIPT, RECORD] {
+        for ending in [RECEIPT_EXTENSION, RECORD_EXTENSION] {
             let _ = remove(&self.path(bag, ending));
         }
         self.deliveries.remove(bag)
     }
 
     fn path(&self, bag: &str, ending: &str) -> PathBuf {
-        self.directory.join(BAGS).join(format!("{bag}.{ending}"))
+        self.directory
+            .join(BAGS_DIRECTORY)
+            .join(format!("{bag}.{ending}"))
     }
 }
 
@@ -182,8 +184,8 @@ impl Records {
 pub fn is_delivered(state: &Path, bag: &Path) -> bool {
     let name = bag.file_name().and_then(|name| name.to_str());
     let receipt = name.and_then(|name| {
-        let path = state.join(DIRECTORY).join(BAGS);
-        fs::read_to_string(path.join(format!("{name}.{RECEIPT}"))).ok()
+        let path = state.join(RECORDS_DIRECTORY).join(BAGS_DIRECTORY);
+        fs::read_to_string(path.join(format!("{name}.{RECEIPT_EXTENSION}"))).ok()
     });
     let fingerprint = Fingerprint::of(bag).ok();
     let fingerprint = fingerprint.filter(|found| !found.is_empty());
@@ -247,7 +249,7 @@ mod tests {
         let state = root.path().join("state");
         let bag = bag(root.path(), "lap");
         assert!(!is_delivered(&state, &bag));
-        let mut records = Records::open(&state.join(DIRECTORY)).unwrap();
+        let mut records = Records::open(&state.join(RECORDS_DIRECTORY)).unwrap();
         let mut delivery = Delivery {
             fingerprint: Fingerprint::of(&bag).unwrap(),
             ..Delivery::default()
@@ -260,13 +262,13 @@ mod tests {
         fs::write(bag.join("0.mcap"), "1234").unwrap();
         assert!(!is_delivered(&state, &bag), "another bag of the same name");
         drop(records);
-        let mut records = Records::open(&state.join(DIRECTORY)).unwrap();
+        let mut records = Records::open(&state.join(RECORDS_DIRECTORY)).unwrap();
         assert_eq!(records.get("lap"), Some(&delivery));
         assert_eq!(records.forget("lap"), Some(delivery));
         assert!(!is_delivered(&state, &bag));
         drop(records);
         assert_eq!(
-            Records::open(&state.join(DIRECTORY))
+            Records::open(&state.join(RECORDS_DIRECTORY))
                 .unwrap()
                 .names()
                 .count(),
@@ -275,10 +277,14 @@ mod tests {
     }
 
     #[test]
-    fn a_damaged_record_is_as_none_and_one_process_works_at_a_time() {
+    fn a_damaged_record_is_ignored_and_a_second_process_is_locked_out() {
         let root = tempfile::tempdir().unwrap();
-        fs::create_dir(root.path().join(BAGS)).unwrap();
-        fs::write(root.path().join(BAGS).join("lap.json"), "{\"fingerp").unwrap();
+        fs::create_dir(root.path().join(BAGS_DIRECTORY)).unwrap();
+        fs::write(
+            root.path().join(BAGS_DIRECTORY).join("lap.json"),
+            "{\"fingerp",
+        )
+        .unwrap();
         let records = Records::open(root.path()).unwrap();
         assert_eq!(records.get("lap"), None);
         let second = Records::open(root.path()).unwrap_err();
@@ -286,11 +292,11 @@ mod tests {
     }
 
     #[test]
-    fn a_record_beyond_the_cap_is_as_none() {
+    fn a_record_beyond_the_size_limit_is_ignored() {
         let root = tempfile::tempdir().unwrap();
-        fs::create_dir(root.path().join(BAGS)).unwrap();
+        fs::create_dir(root.path().join(BAGS_DIRECTORY)).unwrap();
         let mut text = serde_json::to_string(&Delivery::default()).unwrap();
-        let path = root.path().join(BAGS).join("lap.json");
+        let path = root.path().join(BAGS_DIRECTORY).join("lap.json");
         fs::write(&path, &text).unwrap();
         assert!(Records::open(root.path()).unwrap().get("lap").is_some());
         text.push_str(&" ".repeat(usize::try_from(RECORD_BYTES).unwrap()));

@@ -91,7 +91,7 @@ impl Store {
     /// Uses replaced credentials from now on.
     ///
     /// Fails if they cannot be used.
-    pub(crate) fn renew(&mut self) -> Result<(), SettingsError> {
+    pub(crate) fn reload_credentials(&mut self) -> Result<(), SettingsError> {
         let credentials = read(&self.settings)?;
         if credentials != self.credentials {
             self.reopen(credentials)?;
@@ -112,7 +112,7 @@ impl Store {
     }
 
     /// Returns whether an upload of parts outlives this process.
-    pub(crate) const fn resumes(&self) -> bool {
+    pub(crate) const fn is_resumable(&self) -> bool {
         matches!(self.client, Client::Parts(_))
     }
 
@@ -138,7 +138,7 @@ impl Store {
     /// Writes an object at once. It replaces an earlier one.
     pub(crate) async fn put(&self, path: &Path, content: Bytes) -> Result<(), StoreError> {
         if matches!(self.client, Client::Folder(_)) {
-            sleep_until(self.link.turn(content.len())).await;
+            sleep_until(self.link.reserve(content.len())).await;
         }
         let put = self.object_store().put(path, content.into()).await;
         put.map(drop).map_err(|error| self.failed(&error))
@@ -248,7 +248,7 @@ impl FolderFile<'_> {
         let mut rest = content;
         while !rest.is_empty() {
             let piece = rest.split_to(rest.len().min(PIECE_BYTES * 16));
-            sleep_until(self.store.link.turn(piece.len())).await;
+            sleep_until(self.store.link.reserve(piece.len())).await;
             let put = self.upload.put_part(piece.into()).await;
             put.map_err(|error| self.store.failed(&error))?;
         }

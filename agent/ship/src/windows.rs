@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use jiff::civil::Time;
 
-const MINUTES: u32 = 24 * 60;
+const MINUTES_PER_DAY: u32 = 24 * 60;
 
 /// One time of the day, as in `22:00-06:00`. It may pass midnight.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -52,7 +52,7 @@ impl Window {
 impl Windows {
     /// Returns the time until a window opens; zero if one is open.
     #[must_use]
-    pub fn opens_in(&self, now: Time) -> Duration {
+    pub fn time_to_opening(&self, now: Time) -> Duration {
         let second = u64::from(now.second().unsigned_abs());
         let minute =
             u32::from(now.hour().unsigned_abs()) * 60 + u32::from(now.minute().unsigned_abs());
@@ -63,7 +63,7 @@ impl Windows {
         let waits = self
             .0
             .iter()
-            .map(|window| (window.begin + MINUTES - minute) % MINUTES);
+            .map(|window| (window.begin + MINUTES_PER_DAY - minute) % MINUTES_PER_DAY);
         let wait = u64::from(waits.min().unwrap_or(0)) * 60;
         Duration::from_secs(wait.saturating_sub(second))
     }
@@ -78,7 +78,7 @@ fn minutes(text: &str) -> Option<u32> {
     };
     let (hour, minute) = (number(hour)?, number(minute)?);
     let is_time = hour < 24 && minute < 60 || (hour, minute) == (24, 0);
-    is_time.then_some((hour * 60 + minute) % MINUTES)
+    is_time.then_some((hour * 60 + minute) % MINUTES_PER_DAY)
 }
 
 #[cfg(test)]
@@ -102,24 +102,27 @@ mod tests {
             (6, 0, 16 * 3_600),
             (21, 59, 60),
         ] {
-            let opens = night.opens_in(time(hour, minute, 0, 0));
+            let opens = night.time_to_opening(time(hour, minute, 0, 0));
             assert_eq!(opens, Duration::from_secs(wait), "{hour}:{minute}");
         }
         let both = windows(&["22:00-06:00", "12:00-13:00"]);
-        assert_eq!(both.opens_in(time(12, 30, 0, 0)), Duration::ZERO);
-        assert_eq!(both.opens_in(time(11, 59, 30, 0)), Duration::from_secs(30));
+        assert_eq!(both.time_to_opening(time(12, 30, 0, 0)), Duration::ZERO);
         assert_eq!(
-            Windows::default().opens_in(time(3, 0, 0, 0)),
+            both.time_to_opening(time(11, 59, 30, 0)),
+            Duration::from_secs(30)
+        );
+        assert_eq!(
+            Windows::default().time_to_opening(time(3, 0, 0, 0)),
             Duration::ZERO
         );
         assert_eq!(
-            windows(&["20:00-24:00"]).opens_in(time(0, 0, 0, 0)),
+            windows(&["20:00-24:00"]).time_to_opening(time(0, 0, 0, 0)),
             Duration::from_secs(20 * 3_600)
         );
     }
 
     #[test]
-    fn other_texts_are_no_windows() {
+    fn invalid_windows_are_refused() {
         for text in [
             "",
             "22:00",
@@ -139,20 +142,20 @@ mod tests {
     proptest! {
         #[test]
         fn a_window_is_open_at_the_time_at_which_it_opens(
-            begin in 0_u32..MINUTES,
-            length in 1_u32..MINUTES,
+            begin in 0_u32..MINUTES_PER_DAY,
+            length in 1_u32..MINUTES_PER_DAY,
             hour in 0_i8..24,
             minute in 0_i8..60,
             second in 0_i8..60,
         ) {
-            let end = (begin + length) % MINUTES;
+            let end = (begin + length) % MINUTES_PER_DAY;
             let windows = Windows(vec![Window { begin, end }]);
             let now = time(hour, minute, second, 0);
-            let wait = windows.opens_in(now);
+            let wait = windows.time_to_opening(now);
             let then = now.wrapping_add(jiff::SignedDuration::try_from(wait).unwrap());
-            prop_assert_eq!(windows.opens_in(then), Duration::ZERO);
+            prop_assert_eq!(windows.time_to_opening(then), Duration::ZERO);
             let minute = hour as u32 * 60 + minute as u32;
-            let is_inside = (minute + MINUTES - begin) % MINUTES < length;
+            let is_inside = (minute + MINUTES_PER_DAY - begin) % MINUTES_PER_DAY < length;
             prop_assert_eq!(wait == Duration::ZERO, is_inside);
         }
     }

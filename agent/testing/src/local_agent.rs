@@ -196,7 +196,7 @@ pub fn request(address: SocketAddr, method: &str, path: &str, headers: &str) -> 
 
 /// Sends a request to the control API; returns the status, and the body's JSON or null if it is
 /// empty.
-pub fn ask(api: SocketAddr, method: &str, path: &str, body: &str) -> (u16, Value) {
+pub fn call_api(api: SocketAddr, method: &str, path: &str, body: &str) -> (u16, Value) {
     let stream = TcpStream::connect(api).unwrap();
     stream.set_read_timeout(Some(PATIENCE)).unwrap();
     let length = body.len();

@@ -6,7 +6,7 @@ use std::ops::RangeInclusive;
 use std::os::fd::{AsRawFd as _, BorrowedFd};
 use std::time::Duration;
 
-use ros2probe_capture::ahead::{Ahead, Ready};
+use ros2probe_capture::ahead::{Ahead, ReadyItem};
 use ros2probe_capture::filter::{Filter, FilterSettings};
 use ros2probe_capture::reassembly::{FlowKey, Limits, Reassembly};
 use ros2probe_wire::filter::{Budget, Counter};
@@ -106,7 +106,7 @@ impl Kernel {
     }
 
     /// Returns records that user space read from handed-over datagrams since the last call.
-    pub fn take_rest(&mut self) -> Vec<Record> {
+    pub fn take_remainder(&mut self) -> Vec<Record> {
         std::mem::take(&mut self.rest)
     }
 
@@ -128,18 +128,20 @@ impl Kernel {
             if record.kind == kind::HANDOVER {
                 let key = FlowKey::of_handover(0, &record);
                 if let Some(rest) = self.reassembly.hand_over(Timestamp(self.now), key, &record) {
-                    self.ahead.rest(0, rest, |each| ready.push(each));
+                    self.ahead.add_remainder(0, rest, |each| ready.push(each));
                 }
             }
             self.ahead.record(0, record, |each| ready.push(each));
         }
         let mut records = Vec::new();
-        let rest_came = ready.iter().any(|each| matches!(each, Ready::Rest(_)));
+        let rest_came = ready
+            .iter()
+            .any(|each| matches!(each, ReadyItem::Remainder(_)));
         for each in ready {
             match each {
-                Ready::Record(record) if rest_came => self.rest.push(record),
-                Ready::Record(record) => records.push(record),
-                Ready::Rest(rest) => {
+                ReadyItem::Record(record) if rest_came => self.rest.push(record),
+                ReadyItem::Record(record) => records.push(record),
+                ReadyItem::Remainder(rest) => {
                     let handover = rest.handover.map(|record| record.handover());
                     let envelope = Envelope::default();
                     walk::datagram(rest.payload(), &envelope, handover.as_ref(), |found| {
@@ -174,7 +176,7 @@ impl Kernel {
         found.unwrap().1
     }
 
-    fn keep(&mut self, packet: &[u8], ready: &mut Vec<Ready>) {
+    fn keep(&mut self, packet: &[u8], ready: &mut Vec<ReadyItem>) {
         let protocol = if packet[0] >> 4 == 4 { 0x0800 } else { 0x86dd };
         let len = u32::try_from(packet.len()).unwrap();
         let Ok(Some(parsed)) = frame::parse_cooked(protocol, PacketType::HOST, packet, len) else {
@@ -184,7 +186,7 @@ impl Kernel {
             let key = FlowKey::new(0, INTERFACE, false, &parsed, fragment);
             let whole = self.reassembly.fragment(Timestamp(self.now), key, fragment);
             if let Some(rest) = whole.filter(|whole| whole.handover.is_some()) {
-                self.ahead.rest(0, rest, |each| ready.push(each));
+                self.ahead.add_remainder(0, rest, |each| ready.push(each));
             }
         }
     }

@@ -52,7 +52,7 @@ pub enum Operation {
 
 /// What becomes of a request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Fate {
+pub enum RequestOutcome {
     /// The store serves it.
     Serve,
     /// The store refuses it with a status, and a pause in seconds.
@@ -63,7 +63,7 @@ pub enum Fate {
     CutAnswer,
 }
 
-type Decide = Box<dyn FnMut(&Call) -> Fate + Send>;
+type Decide = Box<dyn FnMut(&Call) -> RequestOutcome + Send>;
 
 /// A running store; dropping the value ends it.
 pub struct Store {
@@ -127,7 +127,7 @@ impl Store {
     }
 
     /// Decides on the fate of each request from now on.
-    pub fn decide(&self, decide: impl FnMut(&Call) -> Fate + Send + 'static) {
+    pub fn decide(&self, decide: impl FnMut(&Call) -> RequestOutcome + Send + 'static) {
         self.state().decide = Some(Box::new(decide));
     }
 
@@ -224,12 +224,12 @@ async fn answer(
         let mut state = state.lock().unwrap();
         let is_known = state.keys.is_empty() || state.keys.contains(&call.key);
         match &mut state.decide {
-            _ if !is_known => Fate::Refuse(403, None),
+            _ if !is_known => RequestOutcome::Refuse(403, None),
             Some(decide) => decide(&call),
-            None => Fate::Serve,
+            None => RequestOutcome::Serve,
         }
     };
-    if let Fate::Refuse(status, pause) = fate {
+    if let RequestOutcome::Refuse(status, pause) = fate {
         return Ok(refusal(status, "RefusedByTheTest", pause));
     }
     let mut content = Vec::new();
@@ -237,11 +237,11 @@ async fn answer(
         let data = frame.map_err(|_| Cut)?.into_data().unwrap_or_default();
         state.lock().unwrap().received += data.len();
         content.extend_from_slice(&data);
-        if matches!(fate, Fate::CutAfter(bytes) if content.len() >= bytes) {
+        if matches!(fate, RequestOutcome::CutAfter(bytes) if content.len() >= bytes) {
             return Err(Cut);
         }
     }
-    if matches!(fate, Fate::CutAfter(_)) {
+    if matches!(fate, RequestOutcome::CutAfter(_)) {
         return Err(Cut);
     }
     let checksum = header(&head.headers, "x-amz-content-sha256");
@@ -253,7 +253,7 @@ async fn answer(
     let response = state.serve(&call, upload, content.into());
     state.served.push(call);
     match fate {
-        Fate::CutAnswer => Err(Cut),
+        RequestOutcome::CutAnswer => Err(Cut),
         _ => Ok(response),
     }
 }

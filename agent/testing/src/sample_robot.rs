@@ -478,7 +478,7 @@ pub fn agent() -> AgentFacts {
             open: vec![("port", 4)],
             events: vec![("read", 7)],
             cpu_seconds: 1.5,
-            looks: 1_000,
+            polls: 1_000,
         }),
         ..AgentFacts::new(SourceKind::Wire, Instant::now())
     }

@@ -106,7 +106,7 @@ pub struct Data {
 
 /// A message or change from the server.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum News {
+pub enum ServerMessage {
     /// Channels were advertised or unadvertised; see [`Viewer::channels`].
     Channels,
     Data(Data),
@@ -147,7 +147,7 @@ impl Viewer {
     }
 
     /// Returns the next message, or `None` if no message arrives in time.
-    pub fn next_within(&mut self, patience: Duration) -> Result<Option<News>> {
+    pub fn next_within(&mut self, patience: Duration) -> Result<Option<ServerMessage>> {
         let deadline = Instant::now() + patience;
         loop {
             let left = deadline.saturating_duration_since(Instant::now());
@@ -165,7 +165,7 @@ impl Viewer {
                 Message::Binary(bytes) => return self.binary(&bytes).map(Some),
                 Message::Close(Some(frame)) => {
                     let reason = frame.reason.as_str().to_owned();
-                    return Ok(Some(News::Closed(frame.code.into(), reason)));
+                    return Ok(Some(ServerMessage::Closed(frame.code.into(), reason)));
                 }
                 Message::Close(None) => bail!("closed without a code"),
                 Message::Ping(_) | Message::Pong(_) => {}
@@ -178,17 +178,17 @@ impl Viewer {
     pub fn wait_for<T>(
         &mut self,
         what: &str,
-        mut wanted: impl FnMut(&Self, &News) -> Option<T>,
+        mut wanted: impl FnMut(&Self, &ServerMessage) -> Option<T>,
     ) -> Result<T> {
         let deadline = Instant::now() + PATIENCE;
         loop {
             let left = deadline.saturating_duration_since(Instant::now());
-            let news = self.next_within(left)?;
-            let news = news.with_context(|| format!("no {what}"))?;
-            if let Some(found) = wanted(self, &news) {
+            let server_message = self.next_within(left)?;
+            let server_message = server_message.with_context(|| format!("no {what}"))?;
+            if let Some(found) = wanted(self, &server_message) {
                 return Ok(found);
             }
-            if let News::Closed(code, reason) = news {
+            if let ServerMessage::Closed(code, reason) = server_message {
                 bail!("closed with {code} ({reason}) before {what}");
             }
         }
@@ -269,13 +269,13 @@ impl Viewer {
 
     /// Waits until the server closes the connection. Returns code and reason.
     pub fn wait_for_close(&mut self) -> Result<(u16, String)> {
-        self.wait_for("close", |_, news| match news {
-            News::Closed(code, reason) => Some((*code, reason.clone())),
+        self.wait_for("close", |_, server_message| match server_message {
+            ServerMessage::Closed(code, reason) => Some((*code, reason.clone())),
             _ => None,
         })
     }
 
-    fn text(&mut self, text: &str) -> Result<News> {
+    fn text(&mut self, text: &str) -> Result<ServerMessage> {
         #[derive(Deserialize)]
         #[serde(deny_unknown_fields, rename_all = "camelCase")]
         struct Advertise {
@@ -310,7 +310,7 @@ impl Viewer {
                     let before = self.channels.insert(channel.id, channel);
                     ensure!(before.is_none(), "{before:?} was advertised twice");
                 }
-                Ok(News::Channels)
+                Ok(ServerMessage::Channels)
             }
             "unadvertise" => {
                 let Unadvertise { channel_ids, .. } = serde_json::from_value(value)?;
@@ -321,26 +321,26 @@ impl Viewer {
                         .extract_if(.., |_, channel| *channel == id);
                     self.ended.extend(gone.map(|(id, _)| id));
                 }
-                Ok(News::Channels)
+                Ok(ServerMessage::Channels)
             }
             "status" => {
                 let status: Status = serde_json::from_value(value)?;
                 ensure!(status.level <= 2 && status.op == "status", "{status:?}");
-                Ok(News::Status(status))
+                Ok(ServerMessage::Status(status))
             }
             "removeStatus" => {
                 let RemoveStatus { status_ids, .. } = serde_json::from_value(value)?;
-                Ok(News::Removed(status_ids))
+                Ok(ServerMessage::Removed(status_ids))
             }
             "connectionGraphUpdate" => {
                 self.graph.update(serde_json::from_value(value)?);
-                Ok(News::Graph)
+                Ok(ServerMessage::Graph)
             }
             op => bail!("a server sends no {op}: {text}"),
         }
     }
 
-    fn binary(&self, bytes: &[u8]) -> Result<News> {
+    fn binary(&self, bytes: &[u8]) -> Result<ServerMessage> {
         let (opcode, rest) = bytes.split_first().context("an empty message")?;
         let number = |bytes: &[u8]| u64::from_le_bytes(bytes.try_into().unwrap());
         match opcode {
@@ -353,7 +353,7 @@ impl Viewer {
                         || self.ended.contains(&subscription),
                     "{subscription} is no subscription"
                 );
-                Ok(News::Data(Data {
+                Ok(ServerMessage::Data(Data {
                     subscription,
                     time: number(time),
                     payload: payload.to_vec(),
@@ -362,7 +362,7 @@ impl Viewer {
             2 => {
                 ensure!(self.info.capabilities.iter().any(|each| each == "time"));
                 ensure!(rest.len() == 8, "{} bytes", rest.len());
-                Ok(News::Time(number(rest)))
+                Ok(ServerMessage::Time(number(rest)))
             }
             opcode => bail!("a server sends no binary {opcode}"),
         }

@@ -13,25 +13,27 @@ use crate::functions::{Calls, Library};
 use crate::kernel;
 use crate::mapped::{Mapped, Use};
 use crate::open::open;
-use crate::request::{Activity, Answer, MAX_DESCRIPTORS, MAX_PROCESSES, Means, Place, Request};
+use crate::request::{
+    Activity, Answer, AttachMethod, MAX_DESCRIPTORS, MAX_PROCESSES, Place, Request,
+};
 
 /// Number of process ids in one packet.
-const IDS: usize = 4096;
+const IDS_PER_PACKET: usize = 4096;
 /// Number of libraries in one packet, each with a short path.
-const LIBRARIES: usize = 16;
+const LIBRARIES_PER_PACKET: usize = 16;
 /// Maximum number of characters of a path, which is shown and not opened.
 const MAX_PATH: usize = 256;
 /// Number of states of processes in one packet.
-const STATES: usize = 128;
+const STATES_PER_PACKET: usize = 128;
 /// Maximum number of process ids: a host has this many unless configured otherwise.
 const MAX_IDS: usize = 1 << 16;
 /// Time for the maps of one request. The remaining processes count as unreadable.
-const MAPS_WITHIN: Duration = Duration::from_secs(2);
+const MAPS_TIMEOUT: Duration = Duration::from_secs(2);
 /// Maximum number of bytes of `/proc/<pid>/stat`, and of an environment.
 const MAX_STAT: u64 = 4096;
 const MAX_ENVIRONMENT: u64 = 256 << 10;
 /// Variable with the domain of a ROS process.
-const DOMAIN: &[u8] = b"ROS_DOMAIN_ID=";
+const DOMAIN_VARIABLE: &[u8] = b"ROS_DOMAIN_ID=";
 /// Maximum number of characters of the description of a cause.
 const MAX_REASON: usize = 1024;
 
@@ -67,7 +69,7 @@ fn processes(sink: Sink<'_>) -> io::Result<()> {
     let entries = fs::read_dir("/proc")?.flatten();
     let ids = entries.filter_map(|entry| entry.file_name().to_str()?.parse::<u32>().ok());
     let ids: Vec<_> = ids.take(MAX_IDS).collect();
-    for part in ids.chunks(IDS) {
+    for part in ids.chunks(IDS_PER_PACKET) {
         sink(Answer::Processes(part.to_vec()), Vec::new())?;
     }
     sink(Answer::End, Vec::new())
@@ -78,7 +80,7 @@ fn uses(library: Library, processes: &[u32], sink: Sink<'_>) -> io::Result<()> {
     let began = Instant::now();
     for process in processes.iter().take(MAX_PROCESSES) {
         // A few processes with very long maps must not hide the others.
-        if began.elapsed() > MAPS_WITHIN {
+        if began.elapsed() > MAPS_TIMEOUT {
             closed.push(*process);
             continue;
         }
@@ -101,7 +103,7 @@ fn used(process: u32, used: Use, sink: Sink<'_>) -> io::Result<()> {
     let libraries: Vec<_> = used.libraries.into_iter().map(shortened).collect();
     // A process that links the library statically has no file of it.
     let none = libraries.is_empty().then_some(&[][..]);
-    for part in libraries.chunks(LIBRARIES).chain(none) {
+    for part in libraries.chunks(LIBRARIES_PER_PACKET).chain(none) {
         let libraries = part.to_vec();
         let part = Use { libraries, shares };
         let (used, closed) = (vec![(process, part)], Vec::new());
@@ -111,7 +113,10 @@ fn used(process: u32, used: Use, sink: Sink<'_>) -> io::Result<()> {
 }
 
 fn activities(processes: &[u32], sink: Sink<'_>) -> io::Result<()> {
-    for part in processes.chunks(STATES).take(MAX_PROCESSES / STATES) {
+    for part in processes
+        .chunks(STATES_PER_PACKET)
+        .take(MAX_PROCESSES / STATES_PER_PACKET)
+    {
         let states = part.iter().filter_map(|process| activity(*process));
         sink(Answer::Activities(states.collect()), Vec::new())?;
     }
@@ -120,7 +125,7 @@ fn activities(processes: &[u32], sink: Sink<'_>) -> io::Result<()> {
 
 fn attached(
     peer: Peer,
-    (calls, place, means): (Calls, &Place, Means),
+    (calls, place, means): (Calls, &Place, AttachMethod),
     given: &[OwnedFd],
     sink: Sink<'_>,
 ) -> io::Result<()> {
@@ -199,7 +204,7 @@ fn domain(process: u32) -> Option<u32> {
 
 fn domain_in(environment: &[u8]) -> u32 {
     let mut variables = environment.split(|byte| *byte == 0);
-    let value = variables.find_map(|variable| variable.strip_prefix(DOMAIN));
+    let value = variables.find_map(|variable| variable.strip_prefix(DOMAIN_VARIABLE));
     let value = value.and_then(|value| std::str::from_utf8(value).ok()?.trim().parse().ok());
     value.unwrap_or(0)
 }
@@ -310,7 +315,7 @@ mod tests {
     }
 
     #[test]
-    fn the_longest_answers_fit_a_packet() {
+    fn the_longest_answers_do_not_exceed_a_packet() {
         let mapped = Mapped {
             id: crate::mapped::LibraryId {
                 device: "ffff:ffff".to_owned(),
@@ -319,7 +324,7 @@ mod tests {
             path: PathBuf::from("/\u{1}".repeat(4096)),
             range: "ffffffffffffffff-ffffffffffffffff".to_owned(),
         };
-        let libraries = vec![shortened(mapped); LIBRARIES];
+        let libraries = vec![shortened(mapped); LIBRARIES_PER_PACKET];
         let used = vec![(
             u32::MAX,
             Use {
@@ -342,8 +347,8 @@ mod tests {
                 used: Vec::new(),
                 closed: vec![u32::MAX; MAX_PROCESSES],
             },
-            Answer::Activities(vec![activity; STATES]),
-            Answer::Processes(vec![u32::MAX; IDS]),
+            Answer::Activities(vec![activity; STATES_PER_PACKET]),
+            Answer::Processes(vec![u32::MAX; IDS_PER_PACKET]),
             Answer::Refused("\u{1}".repeat(MAX_REASON)),
         ] {
             let bytes = serde_json::to_vec(&Numbered {

@@ -8,10 +8,10 @@ use std::os::unix::fs::FileExt as _;
 use super::row::{Row, varint};
 
 /// Length of the header of the file, at the start of page 1.
-const HEADER: usize = 100;
+const FILE_HEADER_LEN: usize = 100;
 /// Kinds of a table's pages: interior and leaf.
-const INTERIOR: u8 = 5;
-const LEAF: u8 = 13;
+const INTERIOR_PAGE: u8 = 5;
+const LEAF_PAGE: u8 = 13;
 /// Maximum depth of a tree; a file of 2^32 pages has less than 20.
 const MAX_DEPTH: usize = 32;
 
@@ -29,7 +29,7 @@ pub(super) type Visitor<'a> = dyn FnMut(i64, &Row<'_>) + 'a;
 
 impl Pages {
     pub(super) fn open(file: File) -> io::Result<Self> {
-        let mut header = [0; HEADER];
+        let mut header = [0; FILE_HEADER_LEN];
         file.read_exact_at(&mut header, 0)?;
         let page_size = match u16_at(&header, 16) {
             Some(1) => 65_536,
@@ -78,13 +78,13 @@ impl Pages {
                 self.damaged += 1;
                 continue;
             };
-            let start = if number == 1 { HEADER } else { 0 };
+            let start = if number == 1 { FILE_HEADER_LEN } else { 0 };
             match page.get(start) {
                 // A page that occurs twice is damage.
-                Some(&INTERIOR) if levels.len() < MAX_DEPTH && interior.insert(number) => {
+                Some(&INTERIOR_PAGE) if levels.len() < MAX_DEPTH && interior.insert(number) => {
                     levels.push(children(&page, start));
                 }
-                Some(&LEAF) if leaves < most => {
+                Some(&LEAF_PAGE) if leaves < most => {
                     leaves += 1;
                     for cell in cells(&page, start, 8) {
                         match self.row(&page, cell, limit, &mut row) {

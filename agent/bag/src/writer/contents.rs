@@ -9,7 +9,7 @@ use super::super::{Compression, Form, metadata, qos};
 use super::TopicDescription;
 
 /// The only encoding of ROS 2 messages.
-pub(super) const CDR: &str = "cdr";
+pub(super) const CDR_ENCODING: &str = "cdr";
 
 #[derive(Debug)]
 pub(super) struct Topic {
@@ -21,7 +21,7 @@ pub(super) struct Topic {
     /// Whether the topic has messages; its description is then fixed.
     pub(super) is_written: bool,
     /// All publishers, if they changed after the first message.
-    pub(super) later: Option<Vec<Qos>>,
+    pub(super) latest_qos: Option<Vec<Qos>>,
 }
 
 #[derive(Clone, Debug)]
@@ -60,7 +60,7 @@ impl Topic {
             id: self.channel_id,
             schema_id: self.schema_id,
             topic: description.name.clone(),
-            message_encoding: CDR.to_owned(),
+            message_encoding: CDR_ENCODING.to_owned(),
             metadata,
         };
         (schema, channel)
@@ -74,7 +74,7 @@ impl Topic {
         metadata::Topic {
             name: self.description.name.clone(),
             type_name: self.description.type_name.clone(),
-            serialization_format: CDR.to_owned(),
+            serialization_format: CDR_ENCODING.to_owned(),
             offered_qos_profiles: qos::profiles(&self.description.publishers, form.spelling()),
             type_description_hash: hash.unwrap_or_default(),
             message_count: self.messages + in_current,

@@ -17,22 +17,22 @@ fn a_full_disk_leaves_a_complete_bag() {
     let directory = tempfile::tempdir().unwrap();
     let output = Command::new("unshare")
         .args(["--map-root-user", "--mount", "sh", "-c"])
-        .arg("mount -t tmpfs -o size=5m none \"$1\" && exec \"$0\" --exact full::small_disk --ignored")
+        .arg("mount -t tmpfs -o size=5m none \"$1\" && exec \"$0\" --exact full::a_bag_on_a_small_disk_ends_with_disk_full --ignored")
         .arg(std::env::current_exe().unwrap())
         .arg(directory.path())
         .env(PLACE, directory.path())
         .output()
         .unwrap();
-    let said = String::from_utf8_lossy(&output.stdout);
+    let printed = String::from_utf8_lossy(&output.stdout);
     assert!(
-        output.status.success() && said.contains("1 passed"),
+        output.status.success() && printed.contains("1 passed"),
         "{output:?}"
     );
 }
 
 #[test]
 #[ignore = "started by another test, on a small disk"]
-fn small_disk() {
+fn a_bag_on_a_small_disk_ends_with_disk_full() {
     let path = PathBuf::from(std::env::var_os(PLACE).unwrap()).join("bag");
     let mut writer = Writer::create(&path, Options::default()).unwrap();
     let points = writer

@@ -284,7 +284,7 @@ fn creating_a_bag_in_an_existing_directory_fails() {
 }
 
 #[test]
-fn later_publishers_are_listed_apart_from_the_topic() {
+fn later_publishers_are_listed_separately_from_the_topic() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("later");
     let mut writer = Writer::create(&path, Options::default()).unwrap();

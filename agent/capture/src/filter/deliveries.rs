@@ -18,7 +18,7 @@ use super::super::error_chain::Reason;
 use super::{FilterError, failed, take};
 
 /// Programs and their attach types of linux/bpf.h.
-const RECEIVERS: [(&str, u32); 2] = [("received_ipv4", 19), ("received_ipv6", 20)];
+const RECEIVER_PROGRAMS: [(&str, u32); 2] = [("received_ipv4", 19), ("received_ipv6", 20)];
 
 type KeyWords = [u64; size_of::<DeliveryKey>() / 8];
 type DeliveryWords = [u64; size_of::<Delivery>() / 8];
@@ -58,7 +58,7 @@ impl Deliveries {
             let descriptor = program.fd()?.try_clone();
             Ok(descriptor.map_err(ProgramError::IOError)?)
         };
-        let [(ipv4, _), (ipv6, _)] = RECEIVERS;
+        let [(ipv4, _), (ipv6, _)] = RECEIVER_PROGRAMS;
         let receivers = load(ipv4).and_then(|ipv4| Ok([ipv4, load(ipv6)?]));
         Ok(Self {
             receivers: receivers.map_err(|error| Reason::of(&error)),
@@ -69,8 +69,8 @@ impl Deliveries {
         })
     }
 
-    /// Follows the deliveries of all messages from now on, if it does not yet. `cgroup` is the directory of the
-    /// host hook's control group.
+    /// Follows the deliveries of all messages from now on, if it does not yet. `cgroup` is the
+    /// directory of the host hook's control group.
     ///
     /// # Errors
     /// Fails if the kernel refuses a program, or if the control group is gone.
@@ -79,11 +79,14 @@ impl Deliveries {
             return Ok(());
         }
         let receivers = self.receivers.as_ref().map_err(Clone::clone)?;
-        let links = receivers.iter().zip(RECEIVERS).map(|(program, (_, at))| {
-            let [program, cgroup] =
-                [program.as_fd().as_raw_fd(), cgroup.as_raw_fd()].map(i32::cast_unsigned);
-            bpf::create_link(program, cgroup, at)
-        });
+        let links = receivers
+            .iter()
+            .zip(RECEIVER_PROGRAMS)
+            .map(|(program, (_, at))| {
+                let [program, cgroup] =
+                    [program.as_fd().as_raw_fd(), cgroup.as_raw_fd()].map(i32::cast_unsigned);
+                bpf::create_link(program, cgroup, at)
+            });
         let links: io::Result<_> = links.collect();
         self.links = links.map_err(|error| Reason::of(&NoDeliveries::Link(error)))?;
         let set = self.followed.set(0, 1, 0);
@@ -100,8 +103,8 @@ impl Deliveries {
         let _ = self.followed.set(0, 0, 0);
     }
 
-    /// Returns the delivery of the message that triggered a late call; `None` if it is not known: the
-    /// message came through no UDP socket, or another copy of it came later.
+    /// Returns the delivery of the message that triggered a late call; `None` if it is not known:
+    /// the message came through no UDP socket, or another copy of it came later.
     #[must_use]
     pub fn of(&self, call: &LateCall) -> Option<MessageDelivery> {
         let (source_timestamp, delivery) = self.find(call)?;

@@ -19,13 +19,13 @@ use super::super::bpf;
 use super::super::error_chain::Reason;
 use super::super::tracepoints::{KernelLayout, Tracepoints};
 use super::{
-    Deliveries, Filter, FilterError, FilterSettings, NO_DELIVERIES, UNUSED, failed, load_program,
-    open, ring_size, take,
+    Deliveries, Filter, FilterError, FilterSettings, NO_DELIVERIES, UNUSED_MAP_ENTRIES, failed,
+    load_program, open, ring_size, take,
 };
 
 /// Attach types of linux/bpf.h.
-const INGRESS: u32 = 0;
-const EGRESS: u32 = 1;
+const BPF_CGROUP_INET_INGRESS: u32 = 0;
+const BPF_CGROUP_INET_EGRESS: u32 = 1;
 
 /// State of the host hook in addition to the shared state.
 pub(super) struct HostHook {
@@ -78,7 +78,7 @@ impl Filter {
         } else {
             KernelLayout::unknown(Reason("kernel types were not read".to_owned()))
         };
-        let mut sizes = vec![("PIECES", pieces), ("FLOWS", UNUSED)];
+        let mut sizes = vec![("PIECES", pieces), ("FLOWS", UNUSED_MAP_ENTRIES)];
         if !settings.deliveries {
             sizes.extend(NO_DELIVERIES);
         }
@@ -235,16 +235,24 @@ impl Links {
     /// Fails as [`Filter::attach`] does.
     pub fn create(&self, cgroup: &File) -> Result<Vec<OwnedFd>, FilterError> {
         let zenoh = self.zenoh.iter();
-        let zenoh = zenoh.flat_map(|[one, other]| [(one, INGRESS), (other, EGRESS)]);
-        [(&self.ingress, INGRESS), (&self.egress, EGRESS)]
-            .into_iter()
-            .chain(zenoh)
-            .map(|(program, direction)| link(program, cgroup, direction))
-            .collect::<io::Result<_>>()
-            .map_err(|error| match error.raw_os_error() {
-                Some(libc::EPERM) => FilterError::attachment_refused(error),
-                _ => FilterError::Attach(error),
-            })
+        let zenoh = zenoh.flat_map(|[one, other]| {
+            [
+                (one, BPF_CGROUP_INET_INGRESS),
+                (other, BPF_CGROUP_INET_EGRESS),
+            ]
+        });
+        [
+            (&self.ingress, BPF_CGROUP_INET_INGRESS),
+            (&self.egress, BPF_CGROUP_INET_EGRESS),
+        ]
+        .into_iter()
+        .chain(zenoh)
+        .map(|(program, direction)| link(program, cgroup, direction))
+        .collect::<io::Result<_>>()
+        .map_err(|error| match error.raw_os_error() {
+            Some(libc::EPERM) => FilterError::attachment_refused(error),
+            _ => FilterError::Attach(error),
+        })
     }
 }
 

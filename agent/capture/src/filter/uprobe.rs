@@ -15,9 +15,10 @@ pub use ros2probe_attach::library::Form;
 use ros2probe_attach::request::Place;
 
 use super::{
-    Filter, FilterError, FilterSettings, NO_DELIVERIES, OBJECT, UNUSED, open, ring_size, take,
+    Filter, FilterError, FilterSettings, NO_DELIVERIES, OBJECT, UNUSED_MAP_ENTRIES, open,
+    ring_size, take,
 };
-use crate::breakpoints::{Attached, Breakpoints, Means};
+use crate::breakpoints::{AttachMethod, Attached, Breakpoints};
 use crate::uprobe::attachments::Refusal;
 
 /// The loaded programs; their maps are in the [`Filter`] returned with them.
@@ -34,14 +35,14 @@ impl Filter {
     pub fn load_uprobe(
         settings: &FilterSettings,
         within: Option<u64>,
-        means: Means,
+        means: AttachMethod,
     ) -> Result<(Self, Probes), FilterError> {
         let mut sizes = vec![
             ("PIECES", ring_size(settings.piece_ring_bytes)),
-            ("FLOWS", UNUSED),
-            ("SOCKETS", UNUSED),
-            ("CONNECTIONS", UNUSED),
-            ("CANDIDATES", UNUSED),
+            ("FLOWS", UNUSED_MAP_ENTRIES),
+            ("SOCKETS", UNUSED_MAP_ENTRIES),
+            ("CONNECTIONS", UNUSED_MAP_ENTRIES),
+            ("CANDIDATES", UNUSED_MAP_ENTRIES),
         ];
         sizes.extend(NO_DELIVERIES);
         let ebpf = open(settings, false, &sizes, None, within.unwrap_or(0))?;

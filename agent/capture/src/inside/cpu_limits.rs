@@ -1,5 +1,5 @@
-//! Limits on the speed of CPUs, from `/sys`: a lower maximum frequency, cooling, and the firmware of
-//! Raspberry Pi.
+//! Limits on the speed of CPUs, from `/sys`: a lower maximum frequency, cooling, and the firmware
+//! of Raspberry Pi.
 //!
 //! The files are described in the kernel's documents on CPUFreq (`admin-guide/pm/cpufreq`) and on
 //! the thermal framework (`driver-api/thermal/sysfs-api`). Every user may read them.
@@ -15,26 +15,26 @@ use ros2probe_model::facts::calls::late::CpuLimit;
 /// Maximum number of limits that are reported at once.
 pub const MAX_CPU_LIMITS: usize = 8;
 /// Maximum number of entries that are read from a directory.
-const ENTRIES: usize = 64;
+const MAX_ENTRIES: usize = 64;
 /// Maximum number of bytes that are read from a file.
-const BYTES: u64 = 64;
+const MAX_FILE_BYTES: u64 = 64;
 
-const FREQUENCIES: &str = "devices/system/cpu/cpufreq";
-const COOLING: &str = "class/thermal";
-const FIRMWARE: &str = "devices/platform/soc/soc:firmware/get_throttled";
+const FREQUENCY_PATH: &str = "devices/system/cpu/cpufreq";
+const THERMAL_PATH: &str = "class/thermal";
+const FIRMWARE_PATH: &str = "devices/platform/soc/soc:firmware/get_throttled";
 
 /// Reads the limits that hold at present. `sys` is the mount point of sysfs.
 #[must_use]
 pub fn read(sys: &Path) -> Arc<[CpuLimit]> {
-    let frequencies = entries(&sys.join(FREQUENCIES), "policy");
+    let frequencies = entries(&sys.join(FREQUENCY_PATH), "policy");
     let frequencies = frequencies
         .into_iter()
         .filter_map(|policy| frequency(&policy));
-    let cooling = entries(&sys.join(COOLING), "cooling_device");
+    let cooling = entries(&sys.join(THERMAL_PATH), "cooling_device");
     let cooling = cooling.into_iter().filter_map(|device| cooled(&device));
     let all = frequencies
         .chain(cooling)
-        .chain(firmware(&sys.join(FIRMWARE)));
+        .chain(firmware(&sys.join(FIRMWARE_PATH)));
     all.take(MAX_CPU_LIMITS).collect()
 }
 
@@ -91,7 +91,7 @@ fn entries(directory: &Path, prefix: &str) -> Vec<PathBuf> {
         let name = entry.file_name();
         name.to_str().is_some_and(|name| name.starts_with(prefix))
     });
-    let mut paths: Vec<_> = named.take(ENTRIES).map(|entry| entry.path()).collect();
+    let mut paths: Vec<_> = named.take(MAX_ENTRIES).map(|entry| entry.path()).collect();
     paths.sort();
     paths
 }
@@ -103,7 +103,7 @@ fn number<T: FromStr>(file: &Path) -> Option<T> {
 fn text(file: &Path) -> Option<String> {
     let mut text = String::new();
     let file = File::open(file).ok()?;
-    file.take(BYTES).read_to_string(&mut text).ok()?;
+    file.take(MAX_FILE_BYTES).read_to_string(&mut text).ok()?;
     Some(text.trim().to_owned())
 }
 
@@ -136,7 +136,7 @@ mod tests {
             (&format!("{cooling}1/type"), "pwm-fan"),
             (&format!("{cooling}1/cur_state"), "4"),
             (&format!("{cooling}1/max_state"), "4"),
-            (FIRMWARE, "50005"),
+            (FIRMWARE_PATH, "50005"),
         ]);
         let expected = [
             "CPUs 0 1 2 3 run at 600 of 1500 MHz at most",
@@ -157,14 +157,14 @@ mod tests {
             (&format!("{policy}/cpuinfo_max_freq"), "1500000"),
             ("class/thermal/cooling_device0/type", "Processor"),
             ("class/thermal/cooling_device0/cur_state", "0"),
-            (FIRMWARE, "0x50000"),
+            (FIRMWARE_PATH, "0x50000"),
         ]);
         assert!(read(full.path()).is_empty());
         let malformed = sys(&[
             (&format!("{policy}/related_cpus"), "0"),
             (&format!("{policy}/scaling_max_freq"), "<unknown>"),
             (&format!("{policy}/cpuinfo_max_freq"), "1500000"),
-            (FIRMWARE, "not a number"),
+            (FIRMWARE_PATH, "not a number"),
         ]);
         assert!(read(malformed.path()).is_empty());
         assert!(read(Path::new("/nonexistent")).is_empty());

@@ -2,7 +2,7 @@
 //! items that the kernel programs report.
 //!
 //! Without a bound from a client or an expectation, the bound is learnt. It is three times the 99th
-//! percentile of the callback's calls in the last minutes, and [`LEAST_BOUND`] or more.
+//! percentile of the callback's calls in the last minutes, and [`MIN_BOUND`] or more.
 
 use std::collections::{BTreeSet, HashMap, HashSet};
 use std::fs::File;
@@ -30,20 +30,20 @@ use crate::system::Clocks;
 use crate::tables::CallbackBounds;
 
 /// Minimum of a learnt bound.
-pub const LEAST_BOUND: Duration = Duration::from_millis(5);
+pub const MIN_BOUND: Duration = Duration::from_millis(5);
 /// Ratio of a learnt bound to the 99th percentile.
-const FACTOR: u64 = 3;
+const BOUND_FACTOR: u64 = 3;
 /// Minimum number of calls from which a bound is learnt.
-const LEARNT_FROM: f32 = 50.0;
+const MIN_LEARNT_CALLS: f32 = 50.0;
 /// Part of the calls so far that is forgotten in each round: a round is a second, so that the
 /// bound describes the last minutes.
-const FORGOTTEN: f32 = 1.0 / 180.0;
+const DECAY: f32 = 1.0 / 180.0;
 
 /// Part of a bound by which it rises in a round at most, as a divisor: it doubles in 70 s.
-const RISE: u64 = 100;
+const RISE_DIVISOR: u64 = 100;
 
 /// Maximum number of threads that are named for a span of a late call.
-const NAMED: usize = 4;
+const MAX_NAMED_THREADS: usize = 4;
 
 /// What clients want to know about late calls.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -288,7 +288,7 @@ impl Learnt {
             for ((recent, known), count) in recent.iter_mut().zip(known.iter_mut()).zip(counts) {
                 // Smaller counts began anew.
                 let new = count.checked_sub(*known).unwrap_or(*count);
-                *recent = *recent * (1.0 - FORGOTTEN) + new as f32;
+                *recent = *recent * (1.0 - DECAY) + new as f32;
                 *known = *count;
             }
         }
@@ -296,7 +296,7 @@ impl Learnt {
             return;
         };
         let [duration, delay] = bounds;
-        let slowly = |known: u64, new: u64| new.min(known.saturating_add(known / RISE));
+        let slowly = |known: u64, new: u64| new.min(known.saturating_add(known / RISE_DIVISOR));
         self.learnt = Some(match self.learnt {
             Some([known_duration, known_delay]) => {
                 [slowly(known_duration, duration), slowly(known_delay, delay)]
@@ -305,13 +305,13 @@ impl Learnt {
         });
     }
 
-    /// Returns bounds of duration and delay for the calls of the last minutes, in nanoseconds; `None`
-    /// before enough calls.
+    /// Returns bounds of duration and delay for the calls of the last minutes, in nanoseconds;
+    /// `None` before enough calls.
     fn bounds(&self) -> Option<[u64; 2]> {
         let [duration, delay] = &self.recent;
         let bound = |counts: &[f32; BUCKETS]| {
-            let least = u64::try_from(LEAST_BOUND.as_nanos()).unwrap_or(u64::MAX);
-            p99(counts).map(|p99| p99.saturating_mul(FACTOR).max(least))
+            let least = u64::try_from(MIN_BOUND.as_nanos()).unwrap_or(u64::MAX);
+            p99(counts).map(|p99| p99.saturating_mul(BOUND_FACTOR).max(least))
         };
         // Some callbacks have no delay, for example those of services.
         Some([bound(duration)?, bound(delay).unwrap_or(u64::MAX)])
@@ -331,11 +331,11 @@ impl Learnt {
     }
 }
 
-/// Returns the upper end of the bucket with the 99th percentile, in nanoseconds; `None` if there are
-/// few values.
+/// Returns the upper end of the bucket with the 99th percentile, in nanoseconds; `None` if there
+/// are few values.
 fn p99(counts: &[f32; BUCKETS]) -> Option<u64> {
     let all: f32 = counts.iter().sum();
-    if all < LEARNT_FROM {
+    if all < MIN_LEARNT_CALLS {
         return None;
     }
     let mut below = 0.0;
@@ -347,8 +347,8 @@ fn p99(counts: &[f32; BUCKETS]) -> Option<u64> {
 }
 
 /// Values of `LateCall::accounted`.
-const DURING: u32 = 1;
-const BEFORE: u32 = 2;
+const ACCOUNTED_DURING: u32 = 1;
+const ACCOUNTED_BEFORE: u32 = 2;
 
 /// Returns the unit of a control group, by the inode of its directory.
 pub(super) type UnitOf<'a> = &'a dyn Fn(u64) -> Option<Arc<str>>;
@@ -431,15 +431,15 @@ pub(super) fn convert(
             wait: blocked(&call.stop, unit_of),
         }),
         source: (call.source_timestamp != 0).then_some(Timestamp(call.source_timestamp)),
-        started: clocks.calendar(call.started),
+        started: clocks.wall_time_of(call.started),
         duration: between(call.started, call.ended),
         wait: (call.delay != 0).then(|| Duration::from_nanos(call.delay)),
         bound: LateBound { duration, wait },
         previous,
         busy,
         released_by: released_by.map(|(call, _)| call),
-        states: states(DURING, &call.states),
-        states_before: states(BEFORE, &call.states_before),
+        states: states(ACCOUNTED_DURING, &call.states),
+        states_before: states(ACCOUNTED_BEFORE, &call.states_before),
         activity: has_events.then(|| activity(&call.during, unit_of)),
         activity_before: has_events.then(|| activity(&call.before, unit_of)),
     }
@@ -492,7 +492,7 @@ fn others(others: &[late::Other], unit_of: UnitOf<'_>) -> Vec<OtherThread> {
         })
         .collect();
     others.sort_by(|one, other| other.cmp(one));
-    others.truncate(NAMED);
+    others.truncate(MAX_NAMED_THREADS);
     others.shrink_to_fit();
     others
 }
@@ -527,8 +527,8 @@ fn blocked(blocked: &late::Blocked, unit_of: UnitOf<'_>) -> Blocked {
     }
 }
 
-/// Returns whether the thread that ended a wait is known. An interrupt ends any other wait, whatever
-/// thread it interrupts.
+/// Returns whether the thread that ended a wait is known. An interrupt ends any other wait,
+/// whatever thread it interrupts.
 const fn has_waker(blocked: &late::Blocked) -> bool {
     matches!(blocked.kind as usize, wait::LOCK | wait::STOPPED) && blocked.waker != 0
 }
@@ -634,7 +634,7 @@ mod tests {
         let mut learnt = Learnt::default();
         learnt.add(&counts(&[(0, 1000)]));
         let [duration, _] = learnt.learnt.unwrap();
-        assert_eq!(u128::from(duration), LEAST_BOUND.as_nanos());
+        assert_eq!(u128::from(duration), MIN_BOUND.as_nanos());
     }
 
     #[test]

@@ -31,7 +31,7 @@ use self::observation::Probes;
 use self::programs::Tables;
 use self::table::Round;
 use crate::bell::Bell;
-use crate::breakpoints::Means;
+use crate::breakpoints::AttachMethod;
 use crate::filter::{Deliveries, FilterError};
 use crate::settings::{InsideChoice, LateChoice};
 use crate::shm::directories::Scope;
@@ -65,7 +65,7 @@ pub struct Facts {
     /// Why nothing is attached at present; `None` = the libraries in use have probes.
     pub detached: Option<String>,
     /// Whether calls are observed on demand, and no client needs them.
-    pub is_resting: bool,
+    pub is_idle: bool,
     /// Whether calls have been observed for long enough to show rates.
     pub shows_rates: bool,
     /// What is observed about late calls: `off`, `sums` or `events`.
@@ -102,8 +102,8 @@ struct Work {
 
 impl Inside {
     /// Loads the programs, and attaches them to installed libraries. `cgroup` restricts them to
-    /// processes of this control group. `deliveries` are programs of the host hook, with its control
-    /// group.
+    /// processes of this control group. `deliveries` are programs of the host hook, with its
+    /// control group.
     ///
     /// # Errors
     /// Fails if a capability is missing, or if the kernel has no uprobes.
@@ -116,7 +116,7 @@ impl Inside {
         let mut broker = uprobe::broker(broker)?;
         let within = cgroup.map(uprobe::inode).transpose()?;
         let has_callbacks = matches!(choice, InsideChoice::Full | InsideChoice::Auto);
-        let loaded = programs::load(has_callbacks, within, Means::of_this_kernel());
+        let loaded = programs::load(has_callbacks, within, AttachMethod::of_this_kernel());
         let (programs, mut tables) = loaded.map_err(|error| match error {
             FilterError::Program(_) if within.is_some() => UprobeError::InsideScope(error),
             error => error.into(),
@@ -131,14 +131,14 @@ impl Inside {
         // A node announces its publishers only once, so the probes are attached to installed
         // libraries in advance.
         probes.install(Instant::now(), &mut broker);
-        progress.rest();
+        progress.set_idle();
         let scope = cgroup.map_or(Scope::AllProcesses, |path| {
             Scope::Cgroup(path.to_path_buf())
         });
         let facts = Facts {
             has_callbacks,
             is_on_demand,
-            is_resting: is_on_demand,
+            is_idle: is_on_demand,
             ..Facts::default()
         };
         Ok(Self {
@@ -185,7 +185,7 @@ impl Inside {
     }
 
     /// Sets whether a client needs calls. The setting matters only if calls are observed on demand.
-    pub fn want(&self, wanted: bool) {
+    pub fn set_calls_requested(&self, wanted: bool) {
         let shared = &self.shared;
         let is_on_demand = shared.facts().is_on_demand;
         if is_on_demand && shared.wanted.swap(wanted, Ordering::AcqRel) != wanted {
@@ -194,7 +194,7 @@ impl Inside {
     }
 
     /// Sets what clients want to know about late calls.
-    pub fn want_late(&self, demand: &LateDemand) {
+    pub fn set_late_demand(&self, demand: &LateDemand) {
         let mut known = self.shared.late();
         if *known != *demand {
             let is_first = demand.has_question && !known.has_question;
@@ -238,7 +238,7 @@ impl Shared {
         rounds.unwrap_or_else(PoisonError::into_inner).is_full()
     }
 
-    fn put(&self, round: Round) {
+    fn store_round(&self, round: Round) {
         let rounds = self.rounds.lock();
         let mut rounds = rounds.unwrap_or_else(PoisonError::into_inner);
         rounds.push(round);
@@ -275,7 +275,7 @@ mod tests {
             stop: AtomicBool::new(false),
         };
         for _ in 0..10 {
-            shared.put(Round {
+            shared.store_round(Round {
                 report: Report::default(),
                 publications: Vec::new(),
                 hits: 0,

@@ -12,18 +12,18 @@ use ros2probe_wire::inside::{Announcement, Figures, Handle, announced, kind};
 use crate::tables::InsideNames;
 
 /// Maximum length of a chain of relations.
-const DEPTH: usize = 8;
+const MAX_DEPTH: usize = 8;
 
 /// Names that a process has announced.
 #[derive(Debug, Default)]
 pub struct Names {
-    known: Bounded<InsideNames, HashMap<(Of, u64), Named>>,
+    known: Bounded<InsideNames, HashMap<(ObjectKind, u64), ObjectFact>>,
 }
 
 /// Kinds of objects. Objects of two kinds may have the same address, because one contains the
 /// other.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
-enum Of {
+enum ObjectKind {
     Node,
     Publisher,
     Subscription,
@@ -45,7 +45,7 @@ enum Of {
 
 /// What is known about an object.
 #[derive(Clone, Debug)]
-enum Named {
+enum ObjectFact {
     Node(NodeName),
     /// A publisher, subscription or service.
     Endpoint {
@@ -54,7 +54,7 @@ enum Named {
         middleware: Option<Arc<str>>,
     },
     /// A relation to another object.
-    Is(Of, u64),
+    Relation(ObjectKind, u64),
     Period(Duration),
     Capacity(u32),
 }
@@ -74,7 +74,7 @@ impl Names {
     /// Iterates over the names of all nodes.
     pub fn nodes(&self) -> impl Iterator<Item = &NodeName> {
         self.known.values().filter_map(|named| match named {
-            Named::Node(name) => Some(name),
+            ObjectFact::Node(name) => Some(name),
             _ => None,
         })
     }
@@ -84,7 +84,7 @@ impl Names {
         let (address, parent) = (announcement.address, announcement.parent);
         let endpoint = || {
             let middleware = text(&announcement.second);
-            Named::Endpoint {
+            ObjectFact::Endpoint {
                 node: parent,
                 name: text(&announcement.text).into(),
                 middleware: (!middleware.is_empty()).then(|| middleware.into()),
@@ -92,51 +92,67 @@ impl Names {
         };
         let (of, named) = match announcement.kind {
             announced::NODE => {
-                let name = NodeName::from(joined(
+                let name = NodeName::from(full_name(
                     &text(&announcement.second),
                     &text(&announcement.text),
                 ));
                 self.known
-                    .insert((Of::Node, address), Named::Node(name.clone()));
+                    .insert((ObjectKind::Node, address), ObjectFact::Node(name.clone()));
                 return Some(name);
             }
-            announced::PUBLISHER => (Of::Publisher, endpoint()),
+            announced::PUBLISHER => (ObjectKind::Publisher, endpoint()),
             announced::SUBSCRIPTION => {
                 if announcement.value != 0 {
-                    let is = Named::Is(Of::Subscription, address);
+                    let is = ObjectFact::Relation(ObjectKind::Subscription, address);
                     self.known
-                        .insert((Of::SubscriptionHandle, announcement.value), is);
+                        .insert((ObjectKind::SubscriptionHandle, announcement.value), is);
                 }
-                (Of::Subscription, endpoint())
+                (ObjectKind::Subscription, endpoint())
             }
             announced::SUBSCRIPTION_OBJECT => (
-                Of::SubscriptionObject,
-                Named::Is(Of::SubscriptionHandle, parent),
+                ObjectKind::SubscriptionObject,
+                ObjectFact::Relation(ObjectKind::SubscriptionHandle, parent),
             ),
-            announced::SUBSCRIPTION_CALLBACK => {
-                (Of::Callback, Named::Is(Of::SubscriptionObject, parent))
-            }
+            announced::SUBSCRIPTION_CALLBACK => (
+                ObjectKind::Callback,
+                ObjectFact::Relation(ObjectKind::SubscriptionObject, parent),
+            ),
             announced::TIMER => (
-                Of::Timer,
-                Named::Period(Duration::from_nanos(announcement.value)),
+                ObjectKind::Timer,
+                ObjectFact::Period(Duration::from_nanos(announcement.value)),
             ),
-            announced::TIMER_NODE => (Of::TimerNode, Named::Is(Of::Node, parent)),
-            announced::TIMER_CALLBACK => (Of::Callback, Named::Is(Of::Timer, parent)),
-            announced::SERVICE => (Of::Service, endpoint()),
-            announced::SERVICE_CALLBACK => (Of::Callback, Named::Is(Of::Service, parent)),
-            announced::STATE_MACHINE => (Of::StateMachine, Named::Is(Of::Node, parent)),
+            announced::TIMER_NODE => (
+                ObjectKind::TimerNode,
+                ObjectFact::Relation(ObjectKind::Node, parent),
+            ),
+            announced::TIMER_CALLBACK => (
+                ObjectKind::Callback,
+                ObjectFact::Relation(ObjectKind::Timer, parent),
+            ),
+            announced::SERVICE => (ObjectKind::Service, endpoint()),
+            announced::SERVICE_CALLBACK => (
+                ObjectKind::Callback,
+                ObjectFact::Relation(ObjectKind::Service, parent),
+            ),
+            announced::STATE_MACHINE => (
+                ObjectKind::StateMachine,
+                ObjectFact::Relation(ObjectKind::Node, parent),
+            ),
             announced::BUFFER => {
                 let capacity = u32::try_from(announcement.value).unwrap_or(u32::MAX);
-                (Of::Buffer, Named::Capacity(capacity))
+                (ObjectKind::Buffer, ObjectFact::Capacity(capacity))
             }
             announced::BUFFER_OWNER => {
-                self.known
-                    .insert((Of::Owner, parent), Named::Is(Of::Owned, address));
+                self.known.insert(
+                    (ObjectKind::Owner, parent),
+                    ObjectFact::Relation(ObjectKind::Owned, address),
+                );
                 return None;
             }
-            announced::BUFFER_SUBSCRIPTION => {
-                (Of::Owned, Named::Is(Of::SubscriptionObject, parent))
-            }
+            announced::BUFFER_SUBSCRIPTION => (
+                ObjectKind::Owned,
+                ObjectFact::Relation(ObjectKind::SubscriptionObject, parent),
+            ),
             _ => return None,
         };
         self.known.insert((of, address), named);
@@ -144,11 +160,11 @@ impl Names {
     }
 
     /// Follows relations to an object that is not itself a relation.
-    fn resolve(&self, of: Of, address: u64) -> Option<(Of, u64, &Named)> {
+    fn resolve(&self, of: ObjectKind, address: u64) -> Option<(ObjectKind, u64, &ObjectFact)> {
         let mut at = (of, address);
-        for _ in 0..DEPTH {
+        for _ in 0..MAX_DEPTH {
             match self.known.get(&at)? {
-                Named::Is(of, address) => at = (*of, *address),
+                ObjectFact::Relation(of, address) => at = (*of, *address),
                 named => return Some((at.0, at.1, named)),
             }
         }
@@ -156,15 +172,15 @@ impl Names {
     }
 
     fn node(&self, address: u64) -> Option<NodeName> {
-        match self.known.get(&(Of::Node, address))? {
-            Named::Node(name) => Some(name.clone()),
+        match self.known.get(&(ObjectKind::Node, address))? {
+            ObjectFact::Node(name) => Some(name.clone()),
             _ => None,
         }
     }
 
-    fn endpoint(&self, of: Of, address: u64) -> Option<Endpoint> {
+    fn endpoint(&self, of: ObjectKind, address: u64) -> Option<Endpoint> {
         match self.resolve(of, address)?.2 {
-            Named::Endpoint {
+            ObjectFact::Endpoint {
                 node,
                 name,
                 middleware,
@@ -180,19 +196,19 @@ impl Names {
     /// Returns the topic of a publisher.
     #[must_use]
     pub fn publisher(&self, address: u64) -> Option<Endpoint> {
-        self.endpoint(Of::Publisher, address)
+        self.endpoint(ObjectKind::Publisher, address)
     }
 
     /// Returns the topic of a subscription.
     #[must_use]
     pub fn subscription(&self, address: u64) -> Option<Endpoint> {
-        self.endpoint(Of::Subscription, address)
+        self.endpoint(ObjectKind::Subscription, address)
     }
 
     /// Returns the topic and node of a ring buffer's subscription, else the topic of its publisher.
     #[must_use]
     pub fn buffer(&self, address: u64, publisher: Handle) -> Option<Endpoint> {
-        let subscription = self.endpoint(Of::Owner, address);
+        let subscription = self.endpoint(ObjectKind::Owner, address);
         subscription.or_else(|| {
             let publisher = self.publisher(publisher.address)?;
             // The node is the publisher's, not the subscription's.
@@ -206,8 +222,8 @@ impl Names {
     /// Returns the capacity of a ring buffer.
     #[must_use]
     pub fn capacity(&self, address: u64) -> Option<u32> {
-        match self.known.get(&(Of::Buffer, address))? {
-            Named::Capacity(capacity) => Some(*capacity),
+        match self.known.get(&(ObjectKind::Buffer, address))? {
+            ObjectFact::Capacity(capacity) => Some(*capacity),
             _ => None,
         }
     }
@@ -215,8 +231,8 @@ impl Names {
     /// Returns the node of a state machine.
     #[must_use]
     pub fn machine(&self, address: u64) -> Option<NodeName> {
-        match self.resolve(Of::StateMachine, address)?.2 {
-            Named::Node(name) => Some(name.clone()),
+        match self.resolve(ObjectKind::StateMachine, address)?.2 {
+            ObjectFact::Node(name) => Some(name.clone()),
             _ => None,
         }
     }
@@ -230,7 +246,7 @@ impl Names {
         figures: &Figures,
         topic_of: impl Fn(u64) -> Option<Endpoint>,
     ) -> (Trigger, Option<NodeName>) {
-        let created = self.known.get(&(Of::Callback, callback));
+        let created = self.known.get(&(ObjectKind::Callback, callback));
         let trigger = figures.trigger;
         match trigger.kind {
             kind::SUBSCRIPTION => match self.subscription(trigger.address) {
@@ -242,7 +258,7 @@ impl Names {
             },
             kind::BUFFER => {
                 let of_buffer = (trigger.address != 0).then(|| topic_of(trigger.address));
-                let of_callback = || self.endpoint(Of::Callback, callback);
+                let of_callback = || self.endpoint(ObjectKind::Callback, callback);
                 let endpoint = of_buffer.flatten().or_else(of_callback);
                 let topic = endpoint.as_ref().map(|of| TopicName::from(&*of.name));
                 (
@@ -251,20 +267,20 @@ impl Names {
                 )
             }
             kind::TIMER => {
-                let announced = match self.known.get(&(Of::Timer, trigger.address)) {
-                    Some(Named::Period(period)) => Some(*period),
+                let announced = match self.known.get(&(ObjectKind::Timer, trigger.address)) {
+                    Some(ObjectFact::Period(period)) => Some(*period),
                     _ => None,
                 };
                 let read = (figures.period != 0).then(|| Duration::from_nanos(figures.period));
-                let node = match self.resolve(Of::TimerNode, trigger.address) {
-                    Some((_, _, Named::Node(name))) => Some(name.clone()),
+                let node = match self.resolve(ObjectKind::TimerNode, trigger.address) {
+                    Some((_, _, ObjectFact::Node(name))) => Some(name.clone()),
                     _ => None,
                 };
                 (Trigger::Timer(read.or(announced)), node)
             }
             _ => match created {
-                Some(Named::Is(Of::Service, service)) => {
-                    let service = self.endpoint(Of::Service, *service);
+                Some(ObjectFact::Relation(ObjectKind::Service, service)) => {
+                    let service = self.endpoint(ObjectKind::Service, *service);
                     let name = service.as_ref().map(|of| Arc::clone(&of.name));
                     (Trigger::Service(name), service.and_then(|of| of.node))
                 }
@@ -275,7 +291,7 @@ impl Names {
 }
 
 /// Returns a node's full name.
-fn joined(namespace: &str, name: &str) -> String {
+fn full_name(namespace: &str, name: &str) -> String {
     let namespace = namespace.trim_end_matches('/');
     let slash = if namespace.starts_with('/') || namespace.is_empty() {
         ""
@@ -340,10 +356,10 @@ mod tests {
         let mut names = Names::default();
         names.announce(&announcement(announced::SUBSCRIPTION_OBJECT, 1, 2, 0, ""));
         names.known.insert(
-            (Of::SubscriptionHandle, 2),
-            Named::Is(Of::SubscriptionObject, 1),
+            (ObjectKind::SubscriptionHandle, 2),
+            ObjectFact::Relation(ObjectKind::SubscriptionObject, 1),
         );
-        assert!(names.endpoint(Of::SubscriptionObject, 1).is_none());
+        assert!(names.endpoint(ObjectKind::SubscriptionObject, 1).is_none());
     }
 
     #[test]
@@ -359,9 +375,9 @@ mod tests {
 
     #[test]
     fn node_names_are_joined_and_text_ends_at_the_first_zero() {
-        assert_eq!(joined("/", "talker"), "/talker");
-        assert_eq!(joined("/robot1", "talker"), "/robot1/talker");
-        assert_eq!(joined("robot1", "talker"), "/robot1/talker");
+        assert_eq!(full_name("/", "talker"), "/talker");
+        assert_eq!(full_name("/robot1", "talker"), "/robot1/talker");
+        assert_eq!(full_name("robot1", "talker"), "/robot1/talker");
         assert_eq!(text(b"abc\0def"), "abc");
         assert_eq!(text(&[b'a'; NAME_BYTES]).len(), NAME_BYTES);
     }

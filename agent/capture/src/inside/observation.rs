@@ -15,26 +15,26 @@ use super::table::ProcessTable;
 use super::{Facts, MAX_HITS, Shared, Work};
 use crate::bell::Bell;
 use crate::error_chain::{Reason, in_words};
-use crate::mappings::{MappingEvents, NewMappings, UNCONCERNED};
+use crate::mappings::{MappingEvents, NewMappings, UNRELATED_DELAY};
 use crate::system::{Clocks, wait};
 use crate::threads::Progress;
-use crate::uprobe::attachments::{Attachments, LibraryFacts, RETRY};
+use crate::uprobe::attachments::{Attachments, LibraryFacts, RETRY_DELAY};
 use crate::uprobe::processes::Processes;
 
 /// Interval of reports.
-const EVERY: Duration = Duration::from_secs(1);
+const REPORT_INTERVAL: Duration = Duration::from_secs(1);
 /// Time for which announcements accumulate before they are read.
-const GATHER: Duration = Duration::from_millis(250);
+const ANNOUNCEMENT_DELAY: Duration = Duration::from_millis(250);
 /// Time for which the programs stay detached after all calls exceeded their budget.
-const PAUSE: Duration = Duration::from_secs(60);
+const SUSPENSION_TIME: Duration = Duration::from_secs(60);
 /// Intervals between checks for ended processes while no calls are observed. Each check needs the
 /// broker, which otherwise ends.
-const REVIEW: Duration = Duration::from_secs(600);
-const REVIEW_OF_MANY: Duration = Duration::from_secs(60);
+const REVIEW_INTERVAL: Duration = Duration::from_secs(600);
+const SHORT_REVIEW_INTERVAL: Duration = Duration::from_secs(60);
 /// Number of known processes for the shorter interval: half of those that the programs can have.
-const MANY: usize = PROCESS_CAPACITY as usize / 2;
+const MANY_PROCESSES: usize = PROCESS_CAPACITY as usize / 2;
 /// Number of rounds after which rates are known: two reports that each cover a second of calls.
-const ROUNDS_OF_RATES: u32 = 3;
+const RATE_ROUNDS: u32 = 3;
 
 /// The breakpoints in all libraries.
 pub(super) struct Probes {
@@ -91,15 +91,15 @@ impl Probes {
 
     /// Detaches the probes at calls.
     fn detach(&mut self) {
-        self.at_calls_mut().clear();
+        self.call_probes_mut().clear();
     }
 
-    fn at_calls_mut(&mut self) -> &mut Attachments<Attached> {
+    fn call_probes_mut(&mut self) -> &mut Attachments<Attached> {
         self.on_demand.as_mut().unwrap_or(&mut self.lasting)
     }
 
     /// Returns the probes at calls.
-    fn at_calls(&self) -> &Attachments<Attached> {
+    fn call_probes(&self) -> &Attachments<Attached> {
         self.on_demand.as_ref().unwrap_or(&self.lasting)
     }
 
@@ -107,7 +107,7 @@ impl Probes {
     fn facts(&self, is_resting: bool) -> Vec<LibraryFacts> {
         match is_resting {
             true => self.lasting.facts(),
-            false => self.at_calls().facts(),
+            false => self.call_probes().facts(),
         }
     }
 }
@@ -118,12 +118,12 @@ pub(super) fn follow(shared: &Shared, work: Work) {
     while !shared.stop.load(Ordering::Acquire) {
         shared.progress.step();
         if observation.is_resting && !shared.is_wanted() {
-            observation.rest(shared);
+            observation.wait_idle(shared);
         } else {
-            observation.look(shared);
+            observation.run_round(shared);
         }
     }
-    shared.progress.rest();
+    shared.progress.set_idle();
 }
 
 /// State of the thread.
@@ -147,7 +147,7 @@ struct Observation {
     last_round: Instant,
     last_review: Instant,
     /// Whether the broker did not answer the last request: it may start later than this process.
-    lacks_broker: bool,
+    is_broker_unavailable: bool,
 }
 
 impl Observation {
@@ -168,23 +168,27 @@ impl Observation {
             rounds: 0,
             last_round: now,
             last_review: now,
-            lacks_broker: false,
+            is_broker_unavailable: false,
         }
     }
 
     /// Attaches to libraries in use, and reads the tables. Then waits for the next round, or
     /// becomes idle.
-    fn look(&mut self, shared: &Shared) {
+    fn run_round(&mut self, shared: &Shared) {
         let now = Instant::now();
         if std::mem::take(&mut self.is_resting) {
             self.last_round = now;
             tracing::info!("observing calls: a client needs them");
         }
-        if self.suspended_at.is_some_and(|at| now - at >= PAUSE) {
+        if self
+            .suspended_at
+            .is_some_and(|at| now - at >= SUSPENSION_TIME)
+        {
             self.suspended_at = None;
             tracing::info!("attached again inside processes");
         }
-        // A late round is skipped, so the observation ends only when its last round can be reported.
+        // A late round is skipped, so the observation ends only when its last round can be
+        // reported.
         let ends = !shared.is_wanted() && !shared.is_late();
         let failed = self.find(now, !ends && self.suspended_at.is_none());
         if ends {
@@ -194,17 +198,17 @@ impl Observation {
         (self.late).follow(!ends && self.has_callbacks, &demand, &mut self.tables);
         let clocks = self.set_clocks();
         if !shared.is_late() {
-            self.round(shared, &clocks, ends);
+            self.read_round(shared, &clocks, ends);
         }
         if ends {
-            self.begin_rest(shared, failed);
+            self.become_idle(shared, failed);
             return;
         }
         self.rounds = self.rounds.saturating_add(1);
         let over = || format!("all processes made more than {MAX_HITS} calls per second");
         let detached = failed.or_else(|| self.suspended_at.map(|_| over()));
         self.report(shared, detached);
-        self.wait(shared, now + EVERY);
+        self.wait(shared, now + REPORT_INTERVAL);
     }
 
     /// Finds processes and attaches to their libraries. Returns the error if the broker did not
@@ -224,14 +228,14 @@ impl Observation {
             self.probes.install(now, broker);
         }
         self.probes.follow(&self.processes, to_calls, now, broker);
-        self.lacks_broker = failed.is_some();
+        self.is_broker_unavailable = failed.is_some();
         failed
     }
 
-    fn round(&mut self, shared: &Shared, clocks: &Clocks, is_last: bool) {
+    fn read_round(&mut self, shared: &Shared, clocks: &Clocks, is_last: bool) {
         let elapsed = self.last_round.elapsed();
         self.last_round += elapsed;
-        let showing = self.showing_intra_process();
+        let showing = self.processes_showing_intra_process();
         let (tables, broker) = (&mut self.tables, &mut self.broker);
         let is_showing = |process| showing.contains(&process);
         let late = &self.late;
@@ -240,7 +244,7 @@ impl Observation {
         self.late.set_bounds(&self.table, &mut self.tables);
         round.is_last = is_last;
         let hits = round.hits;
-        shared.put(round);
+        shared.store_round(round);
         if self.suspended_at.is_none() && !is_last && hits > MAX_HITS {
             tracing::warn!(
                 calls_per_second = hits,
@@ -252,7 +256,7 @@ impl Observation {
     }
 
     /// Becomes idle: forgets the calls so far, so that later calls are counted from zero.
-    fn begin_rest(&mut self, shared: &Shared, failed: Option<String>) {
+    fn become_idle(&mut self, shared: &Shared, failed: Option<String>) {
         if let Err(error) = self.tables.forget_calls() {
             let reason = in_words(&error);
             tracing::warn!(
@@ -261,7 +265,7 @@ impl Observation {
             );
         }
         self.table.forget_reports();
-        self.broker.rest();
+        self.broker.disconnect();
         self.is_resting = true;
         self.rounds = 0;
         self.last_review = Instant::now();
@@ -270,12 +274,12 @@ impl Observation {
 
     /// Waits at most one round for a client to need calls, and reads announcements of new
     /// processes.
-    fn rest(&mut self, shared: &Shared) {
+    fn wait_idle(&mut self, shared: &Shared) {
         let now = Instant::now();
-        let interval = match self.lacks_broker {
-            true => RETRY,
-            false if self.table.len() >= MANY => REVIEW_OF_MANY,
-            false => REVIEW,
+        let interval = match self.is_broker_unavailable {
+            true => RETRY_DELAY,
+            false if self.table.len() >= MANY_PROCESSES => SHORT_REVIEW_INTERVAL,
+            false => REVIEW_INTERVAL,
         };
         if now - self.last_review >= interval {
             self.last_review = now;
@@ -284,10 +288,10 @@ impl Observation {
             (self.table).forget_ended(&mut self.tables, &clocks, &mut self.broker);
             self.report(shared, failed);
         }
-        self.wait(shared, now + EVERY);
+        self.wait(shared, now + REPORT_INTERVAL);
         self.set_clocks();
         (self.table).drain(&mut self.tables, &Clocks::read(), &mut self.broker);
-        self.broker.rest();
+        self.broker.disconnect();
     }
 
     /// Waits until `end`, or until the demand changes. Reads announcements during the wait, because
@@ -299,11 +303,11 @@ impl Observation {
             match event {
                 Event::Announced => {
                     (self.table).drain(&mut self.tables, &Clocks::read(), &mut self.broker);
-                    gathers_until = Instant::now() + GATHER;
+                    gathers_until = Instant::now() + ANNOUNCEMENT_DELAY;
                 }
-                Event::Mapped => self.meet_mapped(),
+                Event::Mapped => self.attach_mapped(),
                 Event::Demanded => {
-                    shared.bell.iter().for_each(Bell::silence);
+                    shared.bell.iter().for_each(Bell::drain);
                     return;
                 }
             }
@@ -311,14 +315,14 @@ impl Observation {
     }
 
     /// Attaches probes to a library that a process has just mapped.
-    fn meet_mapped(&mut self) {
+    fn attach_mapped(&mut self) {
         let new = self.take_mapped();
         if !new.is_incomplete && new.processes.is_empty() {
-            std::thread::sleep(UNCONCERNED);
+            std::thread::sleep(UNRELATED_DELAY);
             return;
         }
         // A broker that does not answer is reported in the next round.
-        let met: Result<(), BrokerError> = self.processes.meet(&new, &mut self.broker);
+        let met: Result<(), BrokerError> = self.processes.inspect_mapped(&new, &mut self.broker);
         if met.is_ok() {
             let to_calls = !self.is_resting && self.suspended_at.is_none();
             let now = Instant::now();
@@ -364,8 +368,8 @@ impl Observation {
     }
 
     /// Returns the processes whose library reports every step of messages within them.
-    fn showing_intra_process(&self) -> HashSet<u32> {
-        let at_calls = self.probes.at_calls();
+    fn processes_showing_intra_process(&self) -> HashSet<u32> {
+        let at_calls = self.probes.call_probes();
         let attached = |id| at_calls.probe(id)?.as_ref().ok();
         let shows = |id| attached(id).is_some_and(|attached| attached.shows_intra_process);
         let using = self.processes.using();
@@ -396,8 +400,8 @@ impl Observation {
             has_inspected: true,
             libraries: self.probes.facts(self.is_resting),
             detached,
-            is_resting: self.is_resting,
-            shows_rates: self.rounds >= ROUNDS_OF_RATES,
+            is_idle: self.is_resting,
+            shows_rates: self.rounds >= RATE_ROUNDS,
             late: self.late.observed(),
             without_events: self.late.without_events().map(str::to_owned),
             without_deliveries: self.late.without_deliveries().map(str::to_owned),

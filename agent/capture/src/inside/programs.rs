@@ -21,7 +21,7 @@ use ros2probe_wire::inside::{Counter, Figures, Handle, Process, accounting, cloc
 use zerocopy::FromZeros as _;
 
 use crate::bpf;
-use crate::breakpoints::{self, Breakpoints, Dispatcher, Means};
+use crate::breakpoints::{self, AttachMethod, Breakpoints, Dispatcher};
 use crate::error_chain::Reason;
 use crate::filter::{Aligned, FilterError, absent_is_fine, failed, take};
 use crate::kernel_types::KernelTypes;
@@ -48,13 +48,13 @@ type FollowedWords = [u64; 24 + FOLLOWED_STATES + 15];
 const FOLLOWED_STATES: usize =
     (2 * (size_of::<Blocked>() + size_of::<Activity>()) + size_of::<Handoff>()) / 8;
 /// Tracepoints of the scheduler. The programs have the same names.
-const EVENTS: [&CStr; 2] = [c"sched_switch", c"sched_waking"];
+const SCHEDULER_EVENTS: [&CStr; 2] = [c"sched_switch", c"sched_waking"];
 const _: () = assert!(size_of::<Figures>().is_multiple_of(8));
 
 /// The loaded programs.
 pub struct Programs {
     breakpoints: Breakpoints,
-    /// Programs at the scheduler's [`EVENTS`].
+    /// Programs at the scheduler's [`SCHEDULER_EVENTS`].
     scheduler: Result<[OwnedFd; 2], NoEvents>,
 }
 
@@ -96,7 +96,7 @@ pub struct Attached {
 pub fn load(
     has_callbacks: bool,
     within: Option<u64>,
-    means: Means,
+    means: AttachMethod,
 ) -> Result<(Programs, Tables), FilterError> {
     let architecture = u32::from(cfg!(target_arch = "aarch64"));
     let offsets = accounting_offsets(KernelTypes::read().ok().as_ref());
@@ -160,7 +160,7 @@ fn load_scheduler(ebpf: &mut Ebpf, offsets: &[u32]) -> Result<[OwnedFd; 2], NoEv
         let descriptor = program.fd()?.as_fd().try_clone_to_owned();
         descriptor.map_err(NoEvents::Kernel)
     };
-    let [switch, waking] = EVENTS;
+    let [switch, waking] = SCHEDULER_EVENTS;
     Ok([load(switch)?, load(waking)?])
 }
 
@@ -217,7 +217,7 @@ impl Programs {
             let opened = bpf::open_tracepoint(name, program.as_fd());
             opened.map_err(|error| Reason::of(&NoEvents::Kernel(error)))
         };
-        let [of_switch, of_waking] = EVENTS;
+        let [of_switch, of_waking] = SCHEDULER_EVENTS;
         Ok(Events([open(of_switch, switch)?, open(of_waking, waking)?]))
     }
 }

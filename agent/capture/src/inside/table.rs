@@ -38,9 +38,9 @@ use crate::tables::{
 /// Maximum calls per second of one process. Above it, its calls are no longer counted.
 pub const MAX_PROCESS_HITS: u64 = 50_000;
 /// Minimum time over which calls per second are evaluated: a shorter time may contain only a burst.
-const JUDGED_OVER: Duration = Duration::from_millis(500);
+const MIN_EVALUATION_TIME: Duration = Duration::from_millis(500);
 /// Number of rounds after which a process outside of the control group is inspected again.
-const RECHECK: u32 = 5;
+const RECHECK_ROUNDS: u32 = 5;
 
 /// The observed processes.
 pub struct ProcessTable {
@@ -54,7 +54,7 @@ pub struct ProcessTable {
     units: Bounded<NamedCgroups, HashMap<u64, Option<Arc<str>>>>,
     rounds: u32,
     /// Time since calls per second were last evaluated.
-    unjudged: Duration,
+    since_evaluation: Duration,
 }
 
 /// Result of one round.
@@ -141,7 +141,7 @@ impl ProcessTable {
             cgroups: CgroupPaths::new(cgroup::mount_point().unwrap_or_default()),
             units: Bounded::default(),
             rounds: 0,
-            unjudged: Duration::ZERO,
+            since_evaluation: Duration::ZERO,
         }
     }
 
@@ -160,11 +160,11 @@ impl ProcessTable {
     /// Reads the waiting announcements. `broker` provides facts about the processes.
     pub fn drain(&mut self, tables: &mut Tables, clocks: &Clocks, broker: &mut Broker) {
         while let Some(item) = tables.next_announcement(Item::read) {
-            self.note(item, clocks, broker);
+            self.apply_item(item, clocks, broker);
         }
     }
 
-    fn note(&mut self, item: Option<Item>, clocks: &Clocks, broker: &mut Broker) {
+    fn apply_item(&mut self, item: Option<Item>, clocks: &Clocks, broker: &mut Broker) {
         match item {
             Some(Item::Hop(hop)) => {
                 self.hops.push(hop);
@@ -172,12 +172,19 @@ impl ProcessTable {
             Some(Item::Late(call)) => {
                 self.late.push(*call);
             }
-            Some(Item::Announcement(announcement)) => self.announced(&announcement, clocks, broker),
+            Some(Item::Announcement(announcement)) => {
+                self.apply_announcement(&announcement, clocks, broker);
+            }
             None => {}
         }
     }
 
-    fn announced(&mut self, announcement: &Announcement, clocks: &Clocks, broker: &mut Broker) {
+    fn apply_announcement(
+        &mut self,
+        announcement: &Announcement,
+        clocks: &Clocks,
+        broker: &mut Broker,
+    ) {
         let observed = self.observe(announcement.process, broker);
         if announcement.kind == announced::TRANSITION {
             let transition = Transition {
@@ -185,7 +192,7 @@ impl ProcessTable {
                 node: observed.names.machine(announcement.address),
                 start: text(&announcement.text).into(),
                 goal: text(&announcement.second).into(),
-                at: clocks.calendar(announcement.time),
+                at: clocks.wall_time_of(announcement.time),
             };
             self.transitions.push(transition);
             return;
@@ -258,8 +265,8 @@ impl ProcessTable {
     }
 
     /// Reads everything once. `elapsed`: time since the last round. `shows_intra_process`: whether
-    /// a process's library reports every step of messages within it. `delivery`: how the message of a
-    /// late call came into its process.
+    /// a process's library reports every step of messages within it. `delivery`: how the message of
+    /// a late call came into its process.
     pub fn round(
         &mut self,
         tables: &mut Tables,
@@ -270,9 +277,9 @@ impl ProcessTable {
         delivery: impl Fn(&late::LateCall) -> Option<MessageDelivery>,
     ) -> Round {
         self.rounds = self.rounds.wrapping_add(1);
-        self.unjudged += elapsed;
-        let is_due = self.unjudged >= JUDGED_OVER;
-        let judged = is_due.then(|| std::mem::take(&mut self.unjudged));
+        self.since_evaluation += elapsed;
+        let is_due = self.since_evaluation >= MIN_EVALUATION_TIME;
+        let judged = is_due.then(|| std::mem::take(&mut self.since_evaluation));
         self.drain(tables, clocks, broker);
         let (mut reports, mut hits) = (HashMap::new(), 0);
         let processes: Vec<_> = tables.processes().collect();
@@ -293,13 +300,13 @@ impl ProcessTable {
         });
         for (id, process) in &processes {
             if process.state == state::OUTSIDE {
-                if self.rounds.is_multiple_of(RECHECK) {
+                if self.rounds.is_multiple_of(RECHECK_ROUNDS) {
                     let _ = tables.remove_process(*id);
                 }
                 continue;
             }
             if let Some(over) = judged {
-                hits += self.judge(tables, *id, process, over);
+                hits += self.apply_budget(tables, *id, process, over);
             }
             let report = self.process(*id, process, states.as_ref());
             reports.insert(*id, report);
@@ -398,7 +405,13 @@ impl ProcessTable {
     }
 
     /// Applies the budget of a process to its calls over this time. Returns its calls per second.
-    fn judge(&mut self, tables: &mut Tables, id: u32, process: &Process, over: Duration) -> u64 {
+    fn apply_budget(
+        &mut self,
+        tables: &mut Tables,
+        id: u32,
+        process: &Process,
+        over: Duration,
+    ) -> u64 {
         let observed = self.known.entry(id).or_default();
         let milliseconds = u64::try_from(over.as_millis()).unwrap_or(u64::MAX).max(1);
         let hits = process.hits.saturating_sub(observed.hits);
@@ -455,7 +468,7 @@ impl ProcessTable {
         let names = &observed.names;
         let last = match figures.last {
             0 => Timestamp(0),
-            last => clocks.calendar(last),
+            last => clocks.wall_time_of(last),
         };
         let is_known = match handle.kind {
             kind::PUBLISHER => names.publisher(handle.address).map(|endpoint| {
@@ -553,14 +566,14 @@ impl ProcessTable {
         // A process that does not publish the topic sent another message to the same thread.
         if let (Some(handoff), Trigger::Subscription(topic)) = (&mut late.handoff, &late.trigger) {
             let is_publisher =
-                |thread: &OtherThread| self.publishes(thread.process, topic, figures);
+                |thread: &OtherThread| self.has_publisher(thread.process, topic, figures);
             handoff.sender = handoff.sender.take().filter(is_publisher);
         }
         Some(late)
     }
 
     /// Returns whether a process has a publisher of this topic.
-    fn publishes(&self, process: u32, topic: &str, figures: &[(Handle, Figures)]) -> bool {
+    fn has_publisher(&self, process: u32, topic: &str, figures: &[(Handle, Figures)]) -> bool {
         let Some(observed) = self.known.get(&process) else {
             return false;
         };
@@ -618,10 +631,10 @@ impl ProcessTable {
             node: output.node.or(input.node),
             input: TopicName::from(&*input.name),
             input_source: Timestamp(hop.source_timestamp),
-            taken: clocks.calendar(hop.taken),
-            started: clocks.calendar(hop.started),
+            taken: clocks.wall_time_of(hop.taken),
+            started: clocks.wall_time_of(hop.started),
             output: TopicName::from(&*output.name),
-            published: clocks.calendar(hop.published),
+            published: clocks.wall_time_of(hop.published),
         })
     }
 }
@@ -688,7 +701,7 @@ mod tests {
             announcement.kind,
             announcement.address,
         ) = (u32::MAX, kind, address);
-        table.announced(&announcement, &Clocks::read(), &mut Broker::here());
+        table.apply_announcement(&announcement, &Clocks::read(), &mut Broker::here());
     }
 
     #[test]
@@ -708,7 +721,7 @@ mod tests {
         let (mut table, clocks) = (table(), Clocks::read());
         for _ in 0..20_000 {
             let hop = inside::Hop::new_zeroed();
-            table.note(Some(Item::Hop(hop)), &clocks, &mut Broker::here());
+            table.apply_item(Some(Item::Hop(hop)), &clocks, &mut Broker::here());
         }
         assert_driven::<CausalHops>();
     }
@@ -718,7 +731,7 @@ mod tests {
         let (mut table, clocks) = (table(), Clocks::read());
         for _ in 0..2_000 {
             let call = Box::new(late::LateCall::new_zeroed());
-            table.note(Some(Item::Late(call)), &clocks, &mut Broker::here());
+            table.apply_item(Some(Item::Late(call)), &clocks, &mut Broker::here());
         }
         assert_driven::<LateCalls>();
         assert_eq!(table.late.len(), LateCalls::CAP);

@@ -16,7 +16,7 @@ use crate::settings::{CaptureSettings, ExactChoice, InsideChoice, LateChoice, So
 
 /// Minimum bytes of a namespace: one fragmented datagram fits, however many namespaces share the
 /// cap.
-const LEAST_REASSEMBLY: usize = 1 << 17;
+const MIN_REASSEMBLY_BYTES: usize = 1 << 17;
 
 /// Returns the shared memory that belongs to the observed sockets or namespaces.
 pub(super) fn scope(settings: &CaptureSettings, host: bool) -> Scope {
@@ -124,7 +124,7 @@ pub(super) fn open_wires(
     // All namespaces together stay within the cap.
     let share = limits.bytes / (1 + settings.network_namespaces.len());
     let limits = Limits {
-        bytes: share.max(LEAST_REASSEMBLY),
+        bytes: share.max(MIN_REASSEMBLY_BYTES),
         ..limits
     };
     let wire = WireTapSettings {

@@ -7,7 +7,7 @@ use ros2probe_wire::{ExpandsTooFar, Expansion};
 
 /// Maximum factor of expansion beyond [`Expansion::FREE`]. Captures of images of one colour stay
 /// below it; gzip reaches 1032.
-const FACTOR: u64 = 100;
+const EXPANSION_FACTOR: u64 = 100;
 
 /// A decompressor that fails when its output exceeds the limit for the compressed bytes so far.
 pub(super) struct Gunzip<R: Read> {
@@ -46,8 +46,8 @@ impl<R: Read> Read for Gunzip<R> {
         let read = self.decoder.read(buffer)?;
         self.expanded += read as u64;
         let compressed = self.decoder.get_ref().read;
-        if self.expanded > self.expansion.limit(compressed, FACTOR) {
-            let error = ExpandsTooFar(FACTOR);
+        if self.expanded > self.expansion.limit(compressed, EXPANSION_FACTOR) {
+            let error = ExpandsTooFar(EXPANSION_FACTOR);
             return Err(io::Error::new(io::ErrorKind::FileTooLarge, error));
         }
         Ok(read)

@@ -35,11 +35,11 @@ struct Piece {
 
 /// Result of adding a fragment.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub(super) enum Placed {
+pub(super) enum Placement {
     /// The fragment added missing bytes.
     New,
     /// The fragment added no bytes.
-    Nothing,
+    Duplicate,
     /// The fragment cannot belong to the same datagram. The flow is unchanged.
     Contradiction,
 }
@@ -72,26 +72,26 @@ impl Flow {
     }
 
     /// Adds a fragment. Where fragments overlap, the earlier bytes are kept.
-    pub(super) fn place(&mut self, at: Timestamp, fragment: &Fragment<'_>) -> Placed {
+    pub(super) fn place(&mut self, at: Timestamp, fragment: &Fragment<'_>) -> Placement {
         let (start, end) = (fragment.offset, fragment.end());
         let seen = self.pieces.last().map_or(0, Piece::end);
         let total = self.total();
         let too_long = total.is_some_and(|total| end > total);
         let ends_early = !fragment.more && (seen > end || total.is_some_and(|total| end != total));
         if too_long || ends_early {
-            return Placed::Contradiction;
+            return Placement::Contradiction;
         }
         let mut position = start;
-        let mut placed = Placed::Nothing;
+        let mut placed = Placement::Duplicate;
         while let Some((index, from, to)) = self.gap(position, end) {
             self.fill(index, from, to, fragment);
             position = to;
-            placed = Placed::New;
+            placed = Placement::New;
         }
-        if placed == Placed::Nothing && self.differs(fragment) {
-            return Placed::Contradiction;
+        if placed == Placement::Duplicate && self.differs(fragment) {
+            return Placement::Contradiction;
         }
-        if placed == Placed::New {
+        if placed == Placement::New {
             self.last_seen = self.last_seen.max(at);
             let kept = start.saturating_add(u32::try_from(fragment.bytes.len()).unwrap_or(end));
             if kept < end {

@@ -226,7 +226,7 @@ fn memory_depends_on_received_bytes_and_not_on_the_announced_length() {
 fn finished_datagrams_are_remembered_within_a_cap() {
     let bytes = transport(2000, 0);
     let mut reassembly = Reassembly::new(Limits {
-        remembered: 10,
+        max_finished: 10,
         ..Limits::default()
     });
     for id in 0..1000 {
@@ -391,7 +391,7 @@ proptest! {
             1..200,
         ),
     ) {
-        let limits = Limits { bytes: 20_000, flows: 4, remembered: 3, ..Limits::default() };
+        let limits = Limits { bytes: 20_000, flows: 4, max_finished: 3, ..Limits::default() };
         let mut reassembly = Reassembly::new(limits);
         let bytes = [0x11; 3000];
         for (id, offset, length, more, kept, seconds, handed_over) in parts {

@@ -10,22 +10,25 @@ use ros2probe_wire::Timestamp;
 use ros2probe_wire::frame::PacketType;
 
 /// Offset of the word that holds a block's owner.
-pub(super) const STATUS: usize =
+pub(super) const STATUS_OFFSET: usize =
     offset_of!(tpacket_block_desc, hdr) + offset_of!(tpacket_hdr_v1, block_status);
-const COUNT: usize = offset_of!(tpacket_block_desc, hdr) + offset_of!(tpacket_hdr_v1, num_pkts);
-const FIRST: usize =
+const COUNT_OFFSET: usize =
+    offset_of!(tpacket_block_desc, hdr) + offset_of!(tpacket_hdr_v1, num_pkts);
+const FIRST_OFFSET: usize =
     offset_of!(tpacket_block_desc, hdr) + offset_of!(tpacket_hdr_v1, offset_to_first_pkt);
-const LENGTH: usize = offset_of!(tpacket_block_desc, hdr) + offset_of!(tpacket_hdr_v1, blk_len);
+const LENGTH_OFFSET: usize =
+    offset_of!(tpacket_block_desc, hdr) + offset_of!(tpacket_hdr_v1, blk_len);
 
 const VLAN_TAG: usize =
     offset_of!(tpacket3_hdr, hv1) + offset_of!(tpacket_hdr_variant1, tp_vlan_tci);
 /// The address follows its header at the next multiple of `TPACKET_ALIGNMENT`.
-const ADDRESS: usize = size_of::<tpacket3_hdr>().next_multiple_of(libc::TPACKET_ALIGNMENT);
+const ADDRESS_OFFSET: usize = size_of::<tpacket3_hdr>().next_multiple_of(libc::TPACKET_ALIGNMENT);
 
 // The kernel's ABI does not change; this pins the version of the offsets above.
-const _: () = assert!(STATUS == 8 && COUNT == 12 && FIRST == 16 && LENGTH == 20);
+const _: () =
+    assert!(STATUS_OFFSET == 8 && COUNT_OFFSET == 12 && FIRST_OFFSET == 16 && LENGTH_OFFSET == 20);
 const _: () = assert!(size_of::<tpacket_block_desc>() == 48 && size_of::<tpacket3_hdr>() == 48);
-const _: () = assert!(VLAN_TAG == 32 && ADDRESS == 48 && size_of::<sockaddr_ll>() == 20);
+const _: () = assert!(VLAN_TAG == 32 && ADDRESS_OFFSET == 48 && size_of::<sockaddr_ll>() == 20);
 const _: () = assert!(offset_of!(tpacket3_hdr, tp_mac) == 24);
 
 /// One frame in the ring.
@@ -61,8 +64,8 @@ impl<'a> Frames<'a> {
     #[must_use]
     pub fn new(block: &'a [u8]) -> Self {
         let header = (|| {
-            let length = size(word(block, LENGTH)?);
-            let frames = (word(block, COUNT)?, size(word(block, FIRST)?));
+            let length = size(word(block, LENGTH_OFFSET)?);
+            let frames = (word(block, COUNT_OFFSET)?, size(word(block, FIRST_OFFSET)?));
             block.get(..length).map(|block| (block, frames))
         })();
         match header {
@@ -95,7 +98,7 @@ impl<'a> Iterator for Frames<'a> {
         self.left = self.left.checked_sub(1)?;
         let next = frame(self.block, self.at).and_then(|(frame, step)| {
             // The last frame's step is 0.
-            let forward = step >= ADDRESS || self.left == 0;
+            let forward = step >= ADDRESS_OFFSET || self.left == 0;
             forward.then_some((frame, self.at.checked_add(step)?))
         });
         let Some((frame, at)) = next else {
@@ -120,7 +123,7 @@ fn frame(block: &[u8], at: usize) -> Option<(RingFrame<'_>, usize)> {
     let start = usize::from(half(block, offset_of!(tpacket3_hdr, tp_mac))?);
     let vlan = word(block, VLAN_TAG)?;
     let [_, _, vlan_high, vlan_low] = vlan.to_be_bytes();
-    let address = block.get(ADDRESS..)?;
+    let address = block.get(ADDRESS_OFFSET..)?;
     let protocol = half(address, offset_of!(sockaddr_ll, sll_protocol))?;
     let interface = word(address, offset_of!(sockaddr_ll, sll_ifindex))?;
     let packet_type = *address.get(offset_of!(sockaddr_ll, sll_pkttype))?;
@@ -174,9 +177,13 @@ pub(super) mod tests {
     /// Returns a block as the kernel lays it out; the last frame has a VLAN tag.
     pub(in crate::ring) fn block_of(frames: &[&[u8]]) -> Vec<u8> {
         let mut block = vec![0; 48];
-        put(&mut block, STATUS, libc::TP_STATUS_USER);
-        put(&mut block, COUNT, u32::try_from(frames.len()).unwrap());
-        put(&mut block, FIRST, 48);
+        put(&mut block, STATUS_OFFSET, libc::TP_STATUS_USER);
+        put(
+            &mut block,
+            COUNT_OFFSET,
+            u32::try_from(frames.len()).unwrap(),
+        );
+        put(&mut block, FIRST_OFFSET, 48);
         for (number, bytes) in (1_u32..).zip(frames) {
             let last = number == u32::try_from(frames.len()).unwrap();
             let at = block.len();
@@ -207,13 +214,13 @@ pub(super) mod tests {
                 put(header, VLAN_TAG, 0x2005);
             }
             header[24..26].copy_from_slice(&u16::try_from(start).unwrap().to_ne_bytes());
-            header[ADDRESS + 2..ADDRESS + 4].copy_from_slice(&[0x08, 0x00]);
-            put(header, ADDRESS + 4, number + 10);
-            header[ADDRESS + 10] = 4;
+            header[ADDRESS_OFFSET + 2..ADDRESS_OFFSET + 4].copy_from_slice(&[0x08, 0x00]);
+            put(header, ADDRESS_OFFSET + 4, number + 10);
+            header[ADDRESS_OFFSET + 10] = 4;
             header[start..start + bytes.len()].copy_from_slice(bytes);
         }
         let length = u32::try_from(block.len()).unwrap();
-        put(&mut block, LENGTH, length);
+        put(&mut block, LENGTH_OFFSET, length);
         block
     }
 
@@ -244,9 +251,9 @@ pub(super) mod tests {
         for end in 0..bytes.len() {
             let mut frames = Frames::new(&bytes[..end]);
             assert_eq!((frames.by_ref().count(), frames.damaged()), (0, true));
-            if end > LENGTH + 4 {
+            if end > LENGTH_OFFSET + 4 {
                 let mut bytes = bytes[..end].to_vec();
-                put(&mut bytes, LENGTH, u32::try_from(end).unwrap());
+                put(&mut bytes, LENGTH_OFFSET, u32::try_from(end).unwrap());
                 let mut frames = Frames::new(&bytes);
                 // Without the padding after the last frame the block is still complete.
                 let complete = frames.by_ref().count() == 2;
@@ -261,7 +268,7 @@ pub(super) mod tests {
         for step in [0, 16, u32::MAX] {
             let mut bytes = block();
             put(&mut bytes, 48, step);
-            put(&mut bytes, COUNT, u32::MAX);
+            put(&mut bytes, COUNT_OFFSET, u32::MAX);
             let mut frames = Frames::new(&bytes);
             assert!(frames.by_ref().count() <= 1);
             assert!(frames.damaged());
@@ -278,7 +285,7 @@ pub(super) mod tests {
                 bytes[at] = value;
             }
             let count = Frames::new(&bytes).count();
-            prop_assert!(count <= bytes.len() / ADDRESS);
+            prop_assert!(count <= bytes.len() / ADDRESS_OFFSET);
         }
     }
 }

@@ -316,7 +316,7 @@ fn impossible_sizes_are_refused() {
 #[test]
 fn blocks_have_whole_pages_for_every_page_size() {
     for page in [4096, 16_384, 65_536] {
-        for (wanted, given) in [(1, page), (page + 1, 2 * page), (BLOCK, BLOCK)] {
+        for (wanted, given) in [(1, page), (page + 1, 2 * page), (BLOCK_BYTES, BLOCK_BYTES)] {
             let settings = Settings {
                 block_size: wanted,
                 ..SMALL

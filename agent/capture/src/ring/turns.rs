@@ -6,11 +6,11 @@
 use std::ptr::NonNull;
 use std::sync::atomic::{AtomicU32, Ordering};
 
-use super::block::{Frames, STATUS};
+use super::block::{Frames, STATUS_OFFSET};
 
 /// The blocks, and the index of the next one.
 #[derive(Debug)]
-pub(super) struct Turns {
+pub(super) struct BlockReader {
     start: NonNull<u8>,
     block_size: usize,
     blocks: usize,
@@ -22,14 +22,14 @@ pub(super) struct Turns {
 /// blocks wait for the reader, so a block should not be held for long.
 #[derive(Debug)]
 pub struct Block<'a> {
-    turns: &'a mut Turns,
+    turns: &'a mut BlockReader,
 }
 
 // SAFETY: the caller of `new` guarantees that the memory outlives this value. It is accessed only
 // through this value and belongs to no thread.
-unsafe impl Send for Turns {}
+unsafe impl Send for BlockReader {}
 
-impl Turns {
+impl BlockReader {
     /// Creates a ring over adjacent blocks at `start`.
     ///
     /// # Safety
@@ -78,7 +78,7 @@ impl Turns {
     /// Returns the status word of the next block.
     fn status(&self) -> &AtomicU32 {
         // SAFETY: a block is longer than its header, which has the word (STATUS, a multiple of 4).
-        let word = unsafe { self.start().byte_add(STATUS) };
+        let word = unsafe { self.start().byte_add(STATUS_OFFSET) };
         // SAFETY: the caller of `new` guarantees that the word is aligned and mapped while `self`
         // lives. Kernel and user space access it as one 32-bit word. The kernel does not write it
         // while user space owns the block.
@@ -137,9 +137,9 @@ mod tests {
             Self(NonNull::new(Box::into_raw(words).cast()).unwrap())
         }
 
-        fn turns(&self) -> Turns {
+        fn turns(&self) -> BlockReader {
             // SAFETY: length and alignment are as required, and every test frees the memory last.
-            unsafe { Turns::new(self.0, BLOCK, BLOCKS) }
+            unsafe { BlockReader::new(self.0, BLOCK, BLOCKS) }
         }
 
         /// Acts as the kernel: waits until the block is free, fills it, and releases it.
@@ -147,13 +147,13 @@ mod tests {
             // SAFETY: the block is within the memory.
             let block = unsafe { self.0.byte_add(index * BLOCK) };
             // SAFETY: the word is within the block, after its start.
-            let word = unsafe { block.byte_add(STATUS) };
+            let word = unsafe { block.byte_add(STATUS_OFFSET) };
             // SAFETY: the word is aligned, and both sides access it as an atomic.
             let status = unsafe { AtomicU32::from_ptr(word.cast().as_ptr()) };
             while status.load(Ordering::Acquire) & libc::TP_STATUS_USER != 0 {
                 thread::yield_now();
             }
-            let (head, tail) = (&bytes[..STATUS], &bytes[STATUS + 4..]);
+            let (head, tail) = (&bytes[..STATUS_OFFSET], &bytes[STATUS_OFFSET + 4..]);
             // SAFETY: the kernel's side owns the block, since the reader has released it.
             unsafe { block.copy_from_nonoverlapping(NonNull::from(head).cast(), head.len()) };
             // SAFETY: the address is within the block, after the status.
@@ -176,7 +176,7 @@ mod tests {
     }
 
     /// Waits for the next block and returns its frames.
-    fn next(turns: &mut Turns) -> Vec<Vec<u8>> {
+    fn next(turns: &mut BlockReader) -> Vec<Vec<u8>> {
         loop {
             if let Some(block) = turns.block() {
                 return block.frames().map(|frame| frame.bytes.to_vec()).collect();

@@ -239,7 +239,7 @@ mod tests {
     }
 
     #[test]
-    fn a_message_with_discovery_is_captured_whatever_else_it_contains() {
+    fn a_message_with_discovery_is_always_captured() {
         let mut rules = MessageClassifier::default();
         rules.set(guid(WRITER), Some(Verdict::Meter));
         let participant = message(&[(WRITER, 1), ([0, 1, 0, 0xc2], 1)]);

@@ -5,9 +5,9 @@
 //! allowance is used up. This module reads no clock.
 
 /// Maximum CPU time that is saved, in nanoseconds, so that a starting robot is found immediately.
-pub const SAVINGS: u64 = 1_000_000_000;
+pub const MAX_SAVINGS: u64 = 1_000_000_000;
 /// Reciprocal of the share: 1 % of a CPU.
-pub const SHARE: u64 = 100;
+pub const SHARE_DIVISOR: u64 = 100;
 
 /// CPU time left for listings.
 #[derive(Debug)]
@@ -21,7 +21,7 @@ pub struct CpuAllowance {
 impl Default for CpuAllowance {
     fn default() -> Self {
         Self {
-            left: SAVINGS.cast_signed(),
+            left: MAX_SAVINGS.cast_signed(),
             at: 0,
         }
     }
@@ -29,12 +29,12 @@ impl Default for CpuAllowance {
 
 impl CpuAllowance {
     /// Returns whether CPU time is left at `now`, in nanoseconds of the monotonic clock.
-    pub fn is_left(&mut self, now: u64) -> bool {
-        let gained = now.saturating_sub(self.at) / SHARE;
+    pub fn has_time_left(&mut self, now: u64) -> bool {
+        let gained = now.saturating_sub(self.at) / SHARE_DIVISOR;
         if gained > 0 {
             self.at = now;
             let left = self.left.saturating_add_unsigned(gained);
-            self.left = left.min(SAVINGS.cast_signed());
+            self.left = left.min(MAX_SAVINGS.cast_signed());
         }
         self.left > 0
     }
@@ -52,11 +52,11 @@ mod tests {
     use ros2probe_wire::time::SECOND;
 
     #[test]
-    fn constant_listing_costs_no_more_than_its_share() {
+    fn constant_listing_uses_no_more_cpu_than_its_share() {
         for cost in [1_000, 3_000_000, 700_000_000] {
             let (mut allowance, mut now, mut spent) = (CpuAllowance::default(), SECOND, 0);
             while now < 101 * SECOND {
-                if allowance.is_left(now) {
+                if allowance.has_time_left(now) {
                     allowance.spend(cost);
                     spent += cost;
                 }
@@ -64,7 +64,7 @@ mod tests {
             }
             // The bound is the savings, the share of a hundred seconds, and one listing in
             // progress.
-            let most = SAVINGS + 101 * SECOND / SHARE + cost;
+            let most = MAX_SAVINGS + 101 * SECOND / SHARE_DIVISOR + cost;
             assert!(spent <= most, "{cost}: {spent}");
             assert!(spent > SECOND / 2, "{cost}: {spent}");
         }

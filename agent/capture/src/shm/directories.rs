@@ -10,29 +10,29 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
 use super::cell::SegmentId;
-use super::owner::{LOCKED, Locks};
+use super::owner::{LOCK_SUFFIXES, Locks};
 use crate::tables::{Directories, DirectoryFiles, ScopeProcesses};
 use ros2probe_model::facts::bounded::Bounded;
 
 /// Directory of shared memory.
 const SHARED_MEMORY: &str = "/dev/shm";
 /// Prefixes of file names: Fast DDS 2.x, 3.x.
-const PREFIXES: [&str; 2] = ["fastrtps_", "fastdds_"];
+const FILE_PREFIXES: [&str; 2] = ["fastrtps_", "fastdds_"];
 /// Maximum number of entries read per directory.
 const MAX_LISTED: usize = 65_536;
 /// Granularity of directory timestamps: a directory that changed more recently may change again
 /// without a new timestamp.
-const COARSE: Duration = Duration::from_secs(1);
+const TIMESTAMP_GRANULARITY: Duration = Duration::from_secs(1);
 /// Number of rounds in which a new process may still be mounting directories. Afterwards it is
-/// inspected only once in [`ROUNDS`] rounds.
+/// inspected only once in [`MAX_QUIET_ROUNDS`] rounds.
 const MOUNTING_ROUNDS: u32 = 5;
-const ROUNDS: u32 = 32;
+const MAX_QUIET_ROUNDS: u32 = 32;
 /// Maximum number of levels of cgroups that are read.
-const DEPTH: usize = 8;
+const MAX_DEPTH: usize = 8;
 /// Number of rounds in which a new process may still move to a cgroup in scope.
 const MOVING_ROUNDS: u32 = 3;
 /// Maximum number of rounds without a new process that use the same list of processes.
-const SAME_ROUNDS: u32 = 5;
+const MAX_REUSED_ROUNDS: u32 = 5;
 
 /// Device and inode of a directory of shared memory.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
@@ -105,7 +105,7 @@ impl Scope {
             Self::AllProcesses | Self::Networks(_) => all_processes(),
             Self::Cgroup(cgroup) => {
                 let mut processes = Bounded::default();
-                processes_of(cgroup, DEPTH, &mut processes);
+                processes_of(cgroup, MAX_DEPTH, &mut processes);
                 processes
             }
             Self::Directories(_) => Bounded::default(),
@@ -118,7 +118,7 @@ impl Name {
     #[must_use]
     pub fn parse(name: &str) -> Option<Self> {
         let (generation, rest) = (0_u8..)
-            .zip(PREFIXES)
+            .zip(FILE_PREFIXES)
             .find_map(|(index, prefix)| Some((Generation(index), name.strip_prefix(prefix)?)))?;
         if let Some(number) = rest.strip_prefix("port") {
             let is_number = !number.is_empty() && number.bytes().all(|b| b.is_ascii_digit());
@@ -140,14 +140,14 @@ impl Name {
     /// Returns the file that this lock file protects; `None` if it is not a lock file.
     fn of_lock(name: &str) -> Option<Self> {
         let suffix = |suffix: &&str| name.strip_suffix(*suffix).and_then(Self::parse);
-        LOCKED.iter().find_map(suffix)
+        LOCK_SUFFIXES.iter().find_map(suffix)
     }
 
     /// Returns the file's name.
     #[must_use]
     pub fn file_name(&self) -> String {
         let prefix = |generation: &Generation| {
-            let prefix = PREFIXES.get(usize::from(generation.0));
+            let prefix = FILE_PREFIXES.get(usize::from(generation.0));
             prefix.copied().unwrap_or_default()
         };
         match self {
@@ -182,15 +182,16 @@ impl ShmDirectories {
     /// rounds.
     pub fn find_new(&mut self) {
         self.newest.look();
-        if self.newest.lists || self.is_mounting || matches!(self.scope, Scope::Directories(_)) {
-            self.go_through_scope();
+        if self.newest.must_list || self.is_mounting || matches!(self.scope, Scope::Directories(_))
+        {
+            self.inspect_scope();
         }
     }
 
     /// Finds the directories of shared memory, and forgets those that no living process reaches.
     pub fn find(&mut self) {
         self.newest.look();
-        self.go_through_scope();
+        self.inspect_scope();
     }
 
     /// Returns whether each directory's path still reaches it. A path may lead through a process
@@ -201,19 +202,19 @@ impl ShmDirectories {
         directories.all(|directory| directory.path.exists())
     }
 
-    fn go_through_scope(&mut self) {
+    fn inspect_scope(&mut self) {
         for directory in self.directories.values_mut() {
             directory.seen = false;
         }
         match self.scope.clone() {
             Scope::Directories(directories) => {
                 for directory in directories {
-                    self.reach(&directory);
+                    self.find_directory(&directory);
                 }
             }
             Scope::Cgroup(_) => self.go_through_processes(),
             Scope::AllProcesses | Scope::Networks(_) => {
-                self.reach(Path::new(SHARED_MEMORY));
+                self.find_directory(Path::new(SHARED_MEMORY));
                 self.go_through_processes();
             }
         }
@@ -231,7 +232,7 @@ impl ShmDirectories {
 
     /// Inspects the processes in scope. They are listed again if there may be new ones.
     fn go_through_processes(&mut self) {
-        if self.newest.lists {
+        if self.newest.must_list {
             self.listed = self.scope.processes();
             // The agent itself may be in a cgroup in scope, but has no shared memory.
             if matches!(self.scope, Scope::Cgroup(_)) {
@@ -239,17 +240,18 @@ impl ShmDirectories {
             }
         }
         let processes = std::mem::take(&mut self.listed);
-        self.go_through(&processes);
+        self.inspect_processes(&processes);
         self.listed = processes;
     }
 
-    fn go_through(&mut self, processes: &[u32]) {
+    fn inspect_processes(&mut self, processes: &[u32]) {
         let before = std::mem::take(&mut self.processes);
         self.is_mounting = false;
         for &pid in processes {
             let (known, met) = before.get(&pid).copied().unwrap_or((None, 0));
             self.is_mounting |= met <= MOUNTING_ROUNDS;
-            let is_settled = met > MOUNTING_ROUNDS && met % ROUNDS != pid % ROUNDS;
+            let is_settled =
+                met > MOUNTING_ROUNDS && met % MAX_QUIET_ROUNDS != pid % MAX_QUIET_ROUNDS;
             let directory = match known.and_then(|id| self.directories.get_mut(&id)) {
                 // The path of the directory may lead through another process, which may have ended.
                 Some(directory) if is_settled && (directory.seen || directory.path.exists()) => {
@@ -276,10 +278,10 @@ impl ShmDirectories {
         let devices = PathBuf::from(format!("/proc/{pid}/root/dev"));
         let within = devices.join("shm");
         let is_plain = is_directory(&devices) && is_directory(&within);
-        is_plain.then(|| self.reach(&within)).flatten()
+        is_plain.then(|| self.find_directory(&within)).flatten()
     }
 
-    fn reach(&mut self, path: &Path) -> Option<ShmDirectoryId> {
+    fn find_directory(&mut self, path: &Path) -> Option<ShmDirectoryId> {
         let metadata = fs::metadata(path).ok().filter(Metadata::is_dir)?;
         let id = ShmDirectoryId {
             device: metadata.dev(),
@@ -308,7 +310,8 @@ impl ShmDirectory {
     fn list(&mut self, left_out: &mut u64) -> bool {
         let changed = fs::metadata(&self.path).and_then(|metadata| metadata.modified());
         let changed = changed.ok();
-        let settled = changed.is_some_and(|at| at.elapsed().is_ok_and(|age| age > COARSE));
+        let settled =
+            changed.is_some_and(|at| at.elapsed().is_ok_and(|age| age > TIMESTAMP_GRANULARITY));
         if settled && changed == self.changed {
             return false;
         }
@@ -333,11 +336,11 @@ impl ShmDirectory {
         }
         if entries.next().is_some() {
             *left_out += 1;
-            files = self.keep(files, known);
+            files = self.keep_existing(files, known);
         }
         *left_out += files.len().saturating_sub(DirectoryFiles::CAP) as u64;
         if files.len() > DirectoryFiles::CAP {
-            files = self.choose(files, &locks);
+            files = self.select_files(files, &locks);
         }
         self.files = files.into_iter().collect();
         true
@@ -345,7 +348,11 @@ impl ShmDirectory {
 
     /// For a partially listed directory, returns the `listed` files and the `known` files that
     /// still exist.
-    fn keep(&self, listed: Vec<(Name, u64)>, known: HashMap<Name, u64>) -> Vec<(Name, u64)> {
+    fn keep_existing(
+        &self,
+        listed: Vec<(Name, u64)>,
+        known: HashMap<Name, u64>,
+    ) -> Vec<(Name, u64)> {
         let mut files: HashMap<Name, u64> = listed.into_iter().collect();
         for (name, inode) in known {
             let metadata = || fs::symlink_metadata(self.path.join(name.file_name()));
@@ -359,7 +366,7 @@ impl ShmDirectory {
 
     /// Selects from too many files: first files of living processes, then an equal number per user,
     /// oldest first. No user can hide another's files in this way.
-    fn choose(&self, files: Vec<(Name, u64)>, locks: &[(Name, u64)]) -> Vec<(Name, u64)> {
+    fn select_files(&self, files: Vec<(Name, u64)>, locks: &[(Name, u64)]) -> Vec<(Name, u64)> {
         let device = fs::metadata(&self.path).map_or(0, |metadata| metadata.dev());
         let held = Locks::read();
         let locks = locks.iter();
@@ -369,14 +376,14 @@ impl ShmDirectory {
             .into_iter()
             .partition::<Vec<_>, _>(|(name, _)| alive.contains(name));
         if chosen.len() > DirectoryFiles::CAP {
-            return self.share(chosen, DirectoryFiles::CAP);
+            return self.share_among_users(chosen, DirectoryFiles::CAP);
         }
-        chosen.extend(self.share(others, DirectoryFiles::CAP - chosen.len()));
+        chosen.extend(self.share_among_users(others, DirectoryFiles::CAP - chosen.len()));
         chosen
     }
 
     /// Selects this many files, an equal number per user.
-    fn share(&self, files: Vec<(Name, u64)>, room: usize) -> Vec<(Name, u64)> {
+    fn share_among_users(&self, files: Vec<(Name, u64)>, room: usize) -> Vec<(Name, u64)> {
         let files = files.into_iter().filter_map(|(name, inode)| {
             let metadata = fs::symlink_metadata(self.path.join(name.file_name())).ok()?;
             let age = (metadata.ctime(), metadata.ctime_nsec());
@@ -404,10 +411,10 @@ struct NewestProcess {
     file: Option<File>,
     id: Option<u32>,
     /// Whether the next round lists the processes.
-    lists: bool,
+    must_list: bool,
     /// Number of rounds since the newest process changed, and since the processes were listed.
     rounds: u32,
-    same: u32,
+    rounds_since_list: u32,
 }
 
 impl NewestProcess {
@@ -429,10 +436,11 @@ impl NewestProcess {
         } else {
             self.rounds.saturating_add(1)
         };
-        self.same += 1;
-        self.lists = self.rounds <= MOVING_ROUNDS || self.same >= SAME_ROUNDS;
-        if self.lists {
-            self.same = 0;
+        self.rounds_since_list += 1;
+        self.must_list =
+            self.rounds <= MOVING_ROUNDS || self.rounds_since_list >= MAX_REUSED_ROUNDS;
+        if self.must_list {
+            self.rounds_since_list = 0;
         }
     }
 }
@@ -483,12 +491,12 @@ mod tests {
         let mut lists = |id, rounds: u32| {
             let rounds = (0..rounds).filter(|_| {
                 newest.note(id);
-                newest.lists
+                newest.must_list
             });
             rounds.count()
         };
         assert_eq!(lists(Some(7), MOVING_ROUNDS + 1), 4);
-        assert_eq!(lists(Some(7), 4 * SAME_ROUNDS), 4);
+        assert_eq!(lists(Some(7), 4 * MAX_REUSED_ROUNDS), 4);
         assert_eq!(lists(Some(8), 1), 1);
         assert_eq!(lists(Some(8), MOVING_ROUNDS), 3);
         // If the id is unknown, the processes are always listed.

@@ -62,7 +62,7 @@ impl Inbox {
     }
 
     /// Moves the items of `found` into the queue.
-    pub fn put(&self, found: &mut Vec<Item>) {
+    pub fn add_all(&self, found: &mut Vec<Item>) {
         if found.is_empty() {
             return;
         }
@@ -88,7 +88,7 @@ impl Inbox {
             .as_ref()
             .filter(|_| waiting.bytes.used() >= WAKE_BYTES)
         {
-            bell.silence();
+            bell.drain();
         }
         waiting.bytes.clear();
         waiting.items.take()
@@ -120,7 +120,7 @@ impl Waiting {
             Item::Message { bytes, .. } => bytes.len(),
             Item::Record(_) | Item::Uncertain(_) => 0,
         };
-        if length > self.bytes.room() {
+        if length > self.bytes.remaining() {
             self.items.refuse();
         } else if self.items.push(item).is_none() {
             self.bytes.add(length);
@@ -154,8 +154,8 @@ mod tests {
     fn consecutive_fragments_wait_as_one_record() {
         let inbox = Inbox::default();
         let mut found = vec![fragment(1), fragment(2)];
-        inbox.put(&mut found);
-        inbox.put(&mut vec![fragment(3), fragment(5)]);
+        inbox.add_all(&mut found);
+        inbox.add_all(&mut vec![fragment(3), fragment(5)]);
         assert!(found.is_empty());
         let items = inbox.take();
         assert_eq!(items.len(), 2);
@@ -173,7 +173,7 @@ mod tests {
                 ..Record::default()
             })
         };
-        inbox.put(&mut vec![sample(1), sample(1), sample(2)]);
+        inbox.add_all(&mut vec![sample(1), sample(1), sample(2)]);
         assert_eq!(inbox.take().len(), 3);
     }
 
@@ -190,11 +190,11 @@ mod tests {
             wait(&[listener], Duration::ZERO).unwrap() == Some(0)
         };
         for _ in 0..2 {
-            inbox.put(&mut vec![message(WAKE_BYTES - 1)]);
+            inbox.add_all(&mut vec![message(WAKE_BYTES - 1)]);
             assert!(!rings());
-            inbox.put(&mut vec![message(1), message(1)]);
+            inbox.add_all(&mut vec![message(1), message(1)]);
             assert!(rings());
-            inbox.put(&mut vec![message(WAKE_BYTES)]);
+            inbox.add_all(&mut vec![message(WAKE_BYTES)]);
             assert_eq!(inbox.take().len(), 4);
             assert!(!rings());
         }
@@ -208,7 +208,7 @@ mod tests {
             port: 0,
             bytes: vec![0; 4 << 20],
         };
-        inbox.put(&mut vec![
+        inbox.add_all(&mut vec![
             message(),
             message(),
             message(),
@@ -216,11 +216,11 @@ mod tests {
             message(),
         ]);
         assert_eq!((inbox.take().len(), inbox.refused()), (4, 1));
-        inbox.put(&mut vec![message()]);
+        inbox.add_all(&mut vec![message()]);
         assert_eq!(inbox.take().len(), 1);
         let cap = InboxItems::CAP;
         let mut flood: Vec<_> = (0..cap as u64 + 3).map(Item::Uncertain).collect();
-        inbox.put(&mut flood);
+        inbox.add_all(&mut flood);
         assert_eq!((inbox.take().len(), inbox.refused()), (cap, 4));
         assert_driven::<InboxItems>();
     }
@@ -233,10 +233,10 @@ mod tests {
             port: 7400,
             bytes: vec![0; 1 << 20],
         };
-        inbox.put(&mut (0..20).map(|_| message()).collect());
+        inbox.add_all(&mut (0..20).map(|_| message()).collect());
         assert_eq!((inbox.take().len(), inbox.refused()), (16, 4));
         assert_driven::<InboxBytes>();
-        inbox.put(&mut vec![message()]);
+        inbox.add_all(&mut vec![message()]);
         assert_eq!((inbox.take().len(), inbox.refused()), (1, 4));
     }
 }

@@ -12,20 +12,20 @@ use ros2probe_model::facts::shared_memory::MemoryUse;
 use ros2probe_wire::DomainId;
 
 /// Size of the blocks that a file's metadata counts, in bytes.
-const BLOCK: u64 = 512;
+const FILE_BLOCK_BYTES: u64 = 512;
 
-/// Inode of a network namespace, and a domain. Participants of Fast DDS that have both in common use
-/// shared memory with each other.
-type Meeting = (u64, u32);
+/// Inode of a network namespace, and a domain. Participants of Fast DDS that have both in common
+/// use shared memory with each other.
+type SharingGroup = (u64, u32);
 
 impl ShmDirectories {
-    /// Returns the use of the directories. Network namespaces of processes that this process may not
-    /// inspect are unknown.
+    /// Returns the use of the directories. Network namespaces of processes that this process may
+    /// not inspect are unknown.
     #[must_use]
     pub fn memory_use(&self) -> MemoryUse {
         let locks = Locks::read();
         let mut memory = MemoryUse::default();
-        let mut meetings: BTreeMap<Meeting, u64> = BTreeMap::new();
+        let mut meetings: BTreeMap<SharingGroup, u64> = BTreeMap::new();
         for directory in self.directories.values() {
             let (stale, of_directory) = directory.owners(&locks);
             memory.stale_bytes += stale;
@@ -48,14 +48,14 @@ impl ShmDirectories {
 
 impl ShmDirectory {
     /// Returns the bytes of files of ended processes, and where living processes with ports meet.
-    fn owners(&self, locks: &Locks) -> (u64, BTreeSet<Meeting>) {
+    fn owners(&self, locks: &Locks) -> (u64, BTreeSet<SharingGroup>) {
         let (mut stale, mut meetings) = (0, BTreeSet::new());
         for name in self.files.keys() {
             let path = self.path.join(name.file_name());
             match (locks.owner(&path), name) {
                 (Owner::Dead, _) => {
                     let metadata = fs::symlink_metadata(&path);
-                    stale += metadata.map_or(0, |metadata| metadata.blocks() * BLOCK);
+                    stale += metadata.map_or(0, |metadata| metadata.blocks() * FILE_BLOCK_BYTES);
                 }
                 (Owner::Alive(process), Name::Port(_, number)) => {
                     let network = fs::metadata(Path::new(&format!("/proc/{process}/ns/net")));

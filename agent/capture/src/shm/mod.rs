@@ -41,18 +41,20 @@ use self::tap::{Counters, Tap};
 use super::border::observe;
 use super::container::{is_container, is_service};
 use super::reorder_buffer::ReorderBuffer;
-use super::system::{Clocks, DirectoryWatch, calendar, monotonic, run_first, thread_cpu, wait};
+use super::system::{
+    Clocks, DirectoryWatch, monotonic, run_first, thread_cpu, wait, wall_clock_nanoseconds,
+};
 use crate::threads::{Progress, Spawn, Task};
 use ros2probe_model::observe::input::Input;
 use ros2probe_model::observe::observer::{Observer, Wanted};
 
 /// Interval at which the counters are published.
-const REPORT: u64 = 200_000_000;
+const REPORT_INTERVAL: u64 = 200_000_000;
 /// Length of one sleep while polling is paused.
-const PAUSE: Duration = Duration::from_millis(50);
+const PAUSE_SLEEP: Duration = Duration::from_millis(50);
 
 /// Number of polls in close succession between two readings of their CPU time.
-const ACCOUNT_EVERY: u64 = 16;
+const ACCOUNT_INTERVAL: u64 = 16;
 
 /// Handle of the thread that polls shared memory.
 pub struct SharedMemory {
@@ -70,7 +72,7 @@ pub struct Facts {
     /// CPU time of the tap's thread, in seconds.
     pub cpu_seconds: f64,
     /// Number of polls.
-    pub looks: u64,
+    pub polls: u64,
     /// Factor by which sleeps are extended to stay within the CPU share.
     pub stretch: f64,
     /// Items lost because the queue was full.
@@ -164,7 +166,7 @@ impl SharedMemory {
                     };
                     let at = clocks.monotonic_of(time);
                     let record = match &mut order {
-                        Some(order) => order.polled(at, record),
+                        Some(order) => order.add_polled(at, record),
                         None => Some(record),
                     };
                     if let Some(record) = record {
@@ -195,9 +197,9 @@ impl SharedMemory {
     }
 
     /// Sets the current need, which determines how often the thread polls.
-    pub fn want(&self, wanted: Wanted) {
+    pub fn set_need(&self, wanted: Wanted) {
         let need = match wanted {
-            Wanted::Nothing => Need::Nothing,
+            Wanted::Nothing => Need::Unneeded,
             Wanted::Names => Need::Names,
             Wanted::Samples => Need::Watching,
             Wanted::EverySample => Need::Every,
@@ -243,7 +245,7 @@ impl Shared {
         *facts.unwrap_or_else(PoisonError::into_inner) = Facts {
             counters: tap.counters(),
             cpu_seconds: seconds(thread_cpu()),
-            looks,
+            polls: looks,
             stretch,
             refused: 0,
         };
@@ -270,9 +272,9 @@ fn poll(
     remedy: Option<&str>,
     ended: &PipeReader,
 ) {
-    let mut tap = Tap::new(directories, calendar);
+    let mut tap = Tap::new(directories, wall_clock_nanoseconds);
     let cpus = std::thread::available_parallelism().map_or(1, usize::from);
-    let mut interval = PollInterval::new(budget).on(cpus);
+    let mut interval = PollInterval::new(budget).with_cpus(cpus);
     // Without inotify, a new file is noticed at the next listing.
     let mut watch = DirectoryWatch::new().ok();
     let mut watched: HashMap<ShmDirectoryId, PathBuf> = HashMap::new();
@@ -292,19 +294,19 @@ fn poll(
             tap.close_all();
             reported = 0;
             shared.report(&tap, looks, interval.stretch());
-            shared.progress.rest();
-            std::thread::sleep(PAUSE);
+            shared.progress.set_idle();
+            std::thread::sleep(PAUSE_SLEEP);
             continue;
         }
         let now = monotonic();
         let at = seconds(now);
         let announced = tap.poll(now, &mut found);
-        shared.inbox.put(&mut found);
+        shared.inbox.add_all(&mut found);
         looks += 1;
-        if looks % ACCOUNT_EVERY == 0 || !(tap.is_hurried || tap.misses_nothing) {
+        if looks % ACCOUNT_INTERVAL == 0 || !(tap.is_urgent || tap.needs_every_message) {
             cpu = seconds(thread_cpu());
         }
-        if now.saturating_sub(reported) >= REPORT {
+        if now.saturating_sub(reported) >= REPORT_INTERVAL {
             reported = now;
             shared.report(&tap, looks, interval.stretch());
         }
@@ -315,15 +317,15 @@ fn poll(
                 .find(|need| *need as u8 == wanted)
                 .unwrap_or(Need::Names)
         } else {
-            Need::Nothing
+            Need::Unneeded
         };
         if tap.take_discovery_seen() {
-            interval.announcement(at);
+            interval.announcement_read(at);
         }
         let sleep = interval.sleep(at, cpu, announced, need);
-        tap.is_hurried = interval.is_watching_closely(at);
-        tap.misses_nothing = need == Need::Every;
-        if may_be_first && (tap.is_hurried || tap.misses_nothing) != is_first {
+        tap.is_urgent = interval.is_polling_closely(at);
+        tap.needs_every_message = need == Need::Every;
+        if may_be_first && (tap.is_urgent || tap.needs_every_message) != is_first {
             is_first = !is_first;
             if let Err(error) = run_first(is_first) {
                 (may_be_first, is_first) = (false, false);
@@ -335,7 +337,7 @@ fn poll(
         }
         // While listing has used up its CPU share, events about new files wait as well.
         let Some(watch) = watch.as_mut().filter(|_| tap.may_list(now)) else {
-            shared.progress.rest();
+            shared.progress.set_idle();
             std::thread::sleep(sleep);
             continue;
         };
@@ -343,7 +345,9 @@ fn poll(
             && tap
                 .directories()
                 .all(|(id, path)| watched.get(&id).is_some_and(|known| known == path));
-        let idle = tap.idle(now).filter(|_| is_same && watches_all);
+        let idle = tap
+            .until_next_search(now)
+            .filter(|_| is_same && watches_all);
         if !is_same {
             // A file may have appeared just before: the next listing follows soon.
             let paths = tap.directories();
@@ -355,16 +359,16 @@ fn poll(
         // The creation of a file ends the sleep, so an idle tap may sleep longer.
         let sleep = idle.map_or(sleep, |idle| sleep.max(Duration::from_nanos(idle)));
         let before = thread_cpu();
-        shared.progress.rest();
+        shared.progress.set_idle();
         let ready = wait(&[watch.as_fd(), ended.as_fd()], sleep);
         shared.progress.step();
         if matches!(ready, Ok(Some(0))) && watch.created(|name| Name::parse(name).is_some()) {
             tap.spend(thread_cpu().saturating_sub(before));
             tap.expect_participant();
-            interval.newcomer(at);
+            interval.participant_starting(at);
         }
     }
-    shared.progress.rest();
+    shared.progress.set_idle();
 }
 
 #[expect(

@@ -11,7 +11,7 @@ use std::os::unix::fs::MetadataExt as _;
 use std::path::Path;
 
 /// Suffixes of the lock files.
-pub(super) const LOCKED: [&str; 2] = ["_el", "_sl"];
+pub(super) const LOCK_SUFFIXES: [&str; 2] = ["_el", "_sl"];
 /// The inode of the initial PID namespace (`PROC_PID_INIT_INO`). In other namespaces, `/proc/locks`
 /// omits the locks of processes outside of them.
 const HOST_PROCESSES: u64 = 0xefff_fffc;
@@ -75,7 +75,7 @@ impl Locks {
             return Owner::Unknown;
         }
         let mut owner = Owner::Unknown;
-        for suffix in LOCKED {
+        for suffix in LOCK_SUFFIXES {
             let mut name = path.as_os_str().to_owned();
             name.push(suffix);
             let Ok(metadata) = fs::symlink_metadata(&name) else {
@@ -131,7 +131,7 @@ mod tests {
         fs::write(&path, "x").unwrap();
         // Without a lock file the state is unknown.
         assert!(!Locks::read().is_abandoned(&path));
-        for suffix in LOCKED {
+        for suffix in LOCK_SUFFIXES {
             let name = directory.path().join(format!("fastrtps_port7411{suffix}"));
             let file = fs::File::create(&name).unwrap();
             assert!(Locks::read().is_abandoned(&path));

@@ -7,52 +7,52 @@
 use std::time::Duration;
 
 /// Sleep during bursts of messages, and maximum sleep while a topic is measured, in seconds.
-const BURST: f64 = 100e-6;
-const WATCHING: f64 = 1e-3;
+const BURST_SLEEP: f64 = 100e-6;
+const WATCHING_SLEEP: f64 = 1e-3;
 /// Maximum sleep if only discovery is needed, and after a quiet period.
-const NAMES: f64 = 5e-3;
-const QUIET: f64 = 10e-3;
+const DISCOVERY_SLEEP: f64 = 5e-3;
+const QUIET_SLEEP: f64 = 10e-3;
 /// Sleep if nothing is needed: an occasional poll, since the latest messages stay readable.
-const NOTHING: f64 = 100e-3;
+const UNNEEDED_SLEEP: f64 = 100e-3;
 /// Length of a quiet period.
 const QUIET_AFTER: f64 = 3.0;
 /// Factor by which the sleep grows after an empty poll.
-const SLOWER: f64 = 1.5;
+const SLEEP_GROWTH: f64 = 1.5;
 /// Interval at which the CPU share is computed.
-const ACCOUNT: f64 = 0.1;
+const ACCOUNT_INTERVAL: f64 = 0.1;
 /// Sleep during discovery while the credit is full: each participant announces its names once, and
 /// reuses the buffer some 50 us later. Short sleeps see more than busy polling: the scheduler
 /// prefers threads that wake up.
-const MEETING: f64 = 10e-6;
+const CLOSE_POLL_SLEEP: f64 = 10e-6;
 /// Maximum sleep during discovery, at the end of the credit.
-const SELDOM: f64 = 500e-6;
+const DISCOVERY_LIMIT_SLEEP: f64 = 500e-6;
 /// Time of busy polling after each announcement, and of the shortest sleeps after each message that
 /// is needed: messages arrive in bursts.
-const BURSTS: f64 = 200e-6;
+const BUSY_POLL_TIME: f64 = 200e-6;
 /// Duration of close polling after a participant creates its files, and after each announcement.
 const PARTICIPANT_WATCH: f64 = 0.3;
 const ANNOUNCEMENT_WATCH: f64 = 0.1;
 /// CPU credit for close polling: its maximum, and its growth per second. With the share of a CPU
 /// while topics are measured, a minute in which a robot starts costs less than 2.5 % of a CPU.
-const CREDIT: f64 = 0.4;
+const MAX_CREDIT: f64 = 0.4;
 const CREDIT_PER_SECOND: f64 = 0.002;
-/// Maximum sleep while every message is needed and CPU time is saved for it. In a burst, a sender reuses its buffers after some
-/// 100 us, and its readers are faster than that.
-const EVERY: f64 = 50e-6;
+/// Maximum sleep while every message is needed and CPU time is saved for it. In a burst, a sender
+/// reuses its buffers after some 100 us, and its readers are faster than that.
+const EVERY_MESSAGE_SLEEP: f64 = 50e-6;
 const EARLY_WAKE: f64 = 20e-6;
 /// Maximum CPU time that is saved for polls while every message is needed, so that a short
 /// recording is complete, and maximum overdraft.
-const SAVINGS: f64 = 5.0;
-const OVERDRAFT: f64 = 0.25;
+const MAX_SAVINGS: f64 = 5.0;
+const MAX_OVERDRAFT: f64 = 0.25;
 /// Maximum sleep while anything is needed, whatever a poll costs.
-const LONGEST: f64 = 50e-3;
+const MAX_SLEEP: f64 = 50e-3;
 
 /// Purpose of the tap at a given time.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Need {
     /// No topic that may use shared memory is measured, and no name is missing. New participants
     /// are noticed.
-    Nothing,
+    Unneeded,
     /// No topic is measured; node names and endpoints may be announced.
     Names,
     /// A topic is measured.
@@ -63,7 +63,7 @@ pub enum Need {
 
 impl Need {
     /// Every need, in ascending order.
-    pub const ALL: [Self; 4] = [Self::Nothing, Self::Names, Self::Watching, Self::Every];
+    pub const ALL: [Self; 4] = [Self::Unneeded, Self::Names, Self::Watching, Self::Every];
 }
 
 /// Shares of a CPU, 0.015 for 1.5 %.
@@ -84,11 +84,11 @@ pub struct PollInterval {
     stretch: f64,
     quiet_since: f64,
     accounted: (f64, f64),
-    meeting_until: f64,
-    awake_until: f64,
+    close_until: f64,
+    busy_until: f64,
     /// Whether the machine has another CPU for other processes during busy polling.
-    has_company: bool,
-    was_close: bool,
+    has_spare_cpu: bool,
+    was_polling_closely: bool,
     /// CPU time left for close polling.
     credit: f64,
     /// Remaining budget while every message is needed, with the time and the CPU time at which it
@@ -103,47 +103,47 @@ impl PollInterval {
     pub const fn new(budget: Budget) -> Self {
         Self {
             budget,
-            need: Need::Nothing,
-            sleep: WATCHING,
+            need: Need::Unneeded,
+            sleep: WATCHING_SLEEP,
             stretch: 1.0,
             quiet_since: 0.0,
             accounted: (0.0, 0.0),
-            meeting_until: 0.0,
-            awake_until: 0.0,
-            has_company: false,
-            was_close: false,
-            credit: CREDIT,
-            savings: SAVINGS,
+            close_until: 0.0,
+            busy_until: 0.0,
+            has_spare_cpu: false,
+            was_polling_closely: false,
+            credit: MAX_CREDIT,
+            savings: MAX_SAVINGS,
             spent: (0.0, 0.0),
         }
     }
 
     /// Sets whether busy polling is allowed, which needs more than one CPU.
     #[must_use]
-    pub const fn on(self, cpus: usize) -> Self {
+    pub const fn with_cpus(self, cpus: usize) -> Self {
         Self {
-            has_company: cpus > 1,
+            has_spare_cpu: cpus > 1,
             ..self
         }
     }
 
     /// Starts close polling for a moment, within the credit, because a participant is starting.
-    pub fn newcomer(&mut self, now: f64) {
-        self.watch_closely(now + PARTICIPANT_WATCH);
+    pub fn participant_starting(&mut self, now: f64) {
+        self.poll_closely_until(now + PARTICIPANT_WATCH);
     }
 
     /// Extends close polling, because an announcement was read and more may follow.
-    pub fn announcement(&mut self, now: f64) {
-        self.watch_closely(now + ANNOUNCEMENT_WATCH);
-        if self.has_company && self.credit > CREDIT / 2.0 {
-            self.awake_until = now + BURSTS;
+    pub fn announcement_read(&mut self, now: f64) {
+        self.poll_closely_until(now + ANNOUNCEMENT_WATCH);
+        if self.has_spare_cpu && self.credit > MAX_CREDIT / 2.0 {
+            self.busy_until = now + BUSY_POLL_TIME;
         }
     }
 
     /// Returns whether the tap polls closely because a participant is starting.
     #[must_use]
-    pub fn is_watching_closely(&self, now: f64) -> bool {
-        now < self.meeting_until
+    pub fn is_polling_closely(&self, now: f64) -> bool {
+        now < self.close_until
     }
 
     /// Returns how long to sleep after a poll at `now` that found this many messages; `cpu` is the
@@ -152,46 +152,46 @@ impl PollInterval {
         if found > 0 {
             self.quiet_since = now;
         }
-        if self.was_close {
+        if self.was_polling_closely {
             let (_, used) = std::mem::replace(&mut self.accounted, (now, cpu));
             self.credit -= cpu - used;
         }
-        self.was_close = self.is_watching_closely(now) && self.credit > 0.0;
-        if self.was_close {
-            if now < self.awake_until {
+        self.was_polling_closely = self.is_polling_closely(now) && self.credit > 0.0;
+        if self.was_polling_closely {
+            if now < self.busy_until {
                 return Duration::ZERO;
             }
             // The start of a whole robot uses up the credit slowly. A robot repeats its names: each
             // participant sends them to every later one.
-            let rest = self.credit / CREDIT;
-            self.sleep = (MEETING / rest.powi(4)).min(SELDOM);
+            let rest = self.credit / MAX_CREDIT;
+            self.sleep = (CLOSE_POLL_SLEEP / rest.powi(4)).min(DISCOVERY_LIMIT_SLEEP);
             return Duration::from_secs_f64(self.sleep);
         }
-        self.meeting_until = now;
+        self.close_until = now;
         if (need == Need::Every) != (self.need == Need::Every) {
             // The budget changes, so the measured cost is forgotten.
             (self.stretch, self.accounted) = (1.0, (now, cpu));
             let saved = (now - self.spent.0) * self.budget.every;
-            self.savings = (self.savings + saved).min(SAVINGS);
+            self.savings = (self.savings + saved).min(MAX_SAVINGS);
             self.spent = (now, cpu);
         }
         self.need = need;
-        self.account(now, cpu);
+        self.account_cpu(now, cpu);
         if need == Need::Every {
-            return self.sleep_little(now, cpu, found);
+            return self.short_sleep(now, cpu, found);
         }
         let longest = match need {
-            Need::Nothing => NOTHING,
-            _ if now - self.quiet_since > QUIET_AFTER => QUIET,
-            Need::Names => NAMES,
-            Need::Watching | Need::Every => WATCHING,
+            Need::Unneeded => UNNEEDED_SLEEP,
+            _ if now - self.quiet_since > QUIET_AFTER => QUIET_SLEEP,
+            Need::Names => DISCOVERY_SLEEP,
+            Need::Watching | Need::Every => WATCHING_SLEEP,
         };
         self.sleep = match found {
-            0 => (self.sleep * SLOWER).min(longest),
-            1 => (longest / 2.0).max(BURST),
-            _ => BURST,
+            0 => (self.sleep * SLEEP_GROWTH).min(longest),
+            1 => (longest / 2.0).max(BURST_SLEEP),
+            _ => BURST_SLEEP,
         };
-        let stretched = (self.sleep * self.stretch).min(LONGEST.max(longest));
+        let stretched = (self.sleep * self.stretch).min(MAX_SLEEP.max(longest));
         Duration::from_secs_f64(stretched)
     }
 
@@ -204,48 +204,48 @@ impl PollInterval {
     /// Returns the sleep while every message is needed: shorter for a moment after each message,
     /// which may start a burst. The sleep is never 0, because the thread preempts the processes
     /// whose messages it reads.
-    fn sleep_little(&mut self, now: f64, cpu: f64, found: usize) -> Duration {
+    fn short_sleep(&mut self, now: f64, cpu: f64, found: usize) -> Duration {
         let (then, used) = std::mem::replace(&mut self.spent, (now, cpu));
         let saved = (now - then) * self.budget.every - (cpu - used);
-        self.savings = (self.savings + saved).clamp(-OVERDRAFT, SAVINGS);
-        self.sleep = EVERY;
+        self.savings = (self.savings + saved).clamp(-MAX_OVERDRAFT, MAX_SAVINGS);
+        self.sleep = EVERY_MESSAGE_SLEEP;
         if found > 0 {
-            self.awake_until = now + BURSTS;
+            self.busy_until = now + BUSY_POLL_TIME;
         }
         if self.savings <= 0.0 {
-            let slower = EVERY * self.stretch.max(SLOWER);
-            return Duration::from_secs_f64(slower.min(LONGEST));
+            let slower = EVERY_MESSAGE_SLEEP * self.stretch.max(SLEEP_GROWTH);
+            return Duration::from_secs_f64(slower.min(MAX_SLEEP));
         }
-        Duration::from_secs_f64(if now < self.awake_until {
+        Duration::from_secs_f64(if now < self.busy_until {
             EARLY_WAKE
         } else {
-            EVERY
+            EVERY_MESSAGE_SLEEP
         })
     }
 
-    fn watch_closely(&mut self, until: f64) {
+    fn poll_closely_until(&mut self, until: f64) {
         if self.credit > 0.0 {
-            self.meeting_until = self.meeting_until.max(until);
+            self.close_until = self.close_until.max(until);
         }
     }
 
-    fn account(&mut self, now: f64, cpu: f64) {
+    fn account_cpu(&mut self, now: f64, cpu: f64) {
         let (then, used) = self.accounted;
         let elapsed = now - then;
-        if elapsed < ACCOUNT {
+        if elapsed < ACCOUNT_INTERVAL {
             return;
         }
         self.accounted = (now, cpu);
-        self.credit = (self.credit + elapsed * CREDIT_PER_SECOND).min(CREDIT);
+        self.credit = (self.credit + elapsed * CREDIT_PER_SECOND).min(MAX_CREDIT);
         let share = (cpu - used) / elapsed;
         let budget = match self.need {
             Need::Every => self.budget.every,
-            Need::Nothing | Need::Names | Need::Watching => self.budget.watching,
+            Need::Unneeded | Need::Names | Need::Watching => self.budget.watching,
         };
         // The tap wakes up less often by the factor of the excess, but gradually.
         let wanted = share / budget;
         let correction = wanted.clamp(0.8, 1.5);
-        self.stretch = (self.stretch * correction).clamp(1.0, LONGEST / BURST);
+        self.stretch = (self.stretch * correction).clamp(1.0, MAX_SLEEP / BURST_SLEEP);
     }
 }
 
@@ -314,7 +314,7 @@ mod tests {
             let mut interval = PollInterval::new(BUDGET);
             run(&mut interval, 20.0, 5e-6, need, |_| 0).1
         };
-        assert!((9.0..11.0).contains(&polls(Need::Nothing)));
+        assert!((9.0..11.0).contains(&polls(Need::Unneeded)));
         assert!((90.0..110.0).contains(&polls(Need::Watching)));
         assert!((90.0..110.0).contains(&polls(Need::Names)));
     }
@@ -322,9 +322,9 @@ mod tests {
     #[test]
     fn a_new_participant_causes_close_polling_for_a_limited_time() {
         let mut interval = PollInterval::new(BUDGET);
-        interval.newcomer(100.0);
+        interval.participant_starting(100.0);
         let microseconds = |interval: &mut PollInterval, now, cpu| {
-            interval.sleep(now, cpu, 0, Need::Nothing).as_micros()
+            interval.sleep(now, cpu, 0, Need::Unneeded).as_micros()
         };
         assert_eq!(microseconds(&mut interval, 100.01, 0.0), 10);
         assert_eq!(microseconds(&mut interval, 100.2, 0.0), 10);
@@ -332,9 +332,9 @@ mod tests {
         // Participants start constantly, and close polls take a third of a CPU.
         let (mut now, mut cpu) = (101.0, 0.0);
         while now < 201.0 {
-            interval.newcomer(now);
+            interval.participant_starting(now);
             microseconds(&mut interval, now, cpu);
-            let close = interval.was_close;
+            let close = interval.was_polling_closely;
             now += 0.01;
             cpu += if close { 0.003 } else { 0.0 };
         }
@@ -345,12 +345,12 @@ mod tests {
     #[test]
     fn the_start_of_a_robot_is_polled_closely_within_the_credit() {
         for cost in [8e-6, 25e-6] {
-            let mut interval = PollInterval::new(BUDGET).on(2);
+            let mut interval = PollInterval::new(BUDGET).with_cpus(2);
             let (mut now, mut cpu, mut polls, mut longest) = (100.0, 0.0, 0_u32, Duration::ZERO);
             // The nodes of the robot start within 6 s, and user data flows.
             while now < 160.0 {
                 if now < 106.0 {
-                    interval.newcomer(now);
+                    interval.participant_starting(now);
                 }
                 let is_starting = now < 106.0;
                 let slept = interval.sleep(now, cpu, usize::from(polls % 4 == 0), Need::Watching);
@@ -372,11 +372,11 @@ mod tests {
     #[test]
     fn an_announcement_causes_busy_polling_if_other_processes_have_a_cpu() {
         for cpus in [1, 2] {
-            let mut interval = PollInterval::new(BUDGET).on(cpus);
-            interval.newcomer(100.0);
+            let mut interval = PollInterval::new(BUDGET).with_cpus(cpus);
+            interval.participant_starting(100.0);
             let mut microseconds = |now, is_announced, cpu| {
                 if is_announced {
-                    interval.announcement(now);
+                    interval.announcement_read(now);
                 }
                 interval.sleep(now, cpu, 1, Need::Names).as_micros()
             };
@@ -395,12 +395,12 @@ mod tests {
     #[test]
     fn polling_for_every_message_runs_every_50_us_within_its_own_budget() {
         let idle = |_: f64| 0;
-        let mut interval = PollInterval::new(BUDGET).on(2);
+        let mut interval = PollInterval::new(BUDGET).with_cpus(2);
         let (share, looks) = run(&mut interval, 10.0, 8e-6, Need::Every, idle);
         assert!(looks > 15_000.0 && share < 0.16, "{looks} {share}");
         // The load is a hundred thousand messages per second, with cheap and with expensive polls.
         for cost in [8e-6, 60e-6] {
-            let mut interval = PollInterval::new(BUDGET).on(2);
+            let mut interval = PollInterval::new(BUDGET).with_cpus(2);
             (interval.need, interval.savings) = (Need::Every, 0.0);
             let (share, looks) = run(&mut interval, 20.0, cost, Need::Every, |_| 10);
             assert!(share <= 0.27 && looks > 2000.0, "{cost} {share} {looks}");
@@ -412,7 +412,7 @@ mod tests {
 
     #[test]
     fn a_needed_message_causes_an_early_poll_within_the_budget() {
-        let mut interval = PollInterval::new(BUDGET).on(2);
+        let mut interval = PollInterval::new(BUDGET).with_cpus(2);
         let mut microseconds =
             |now, cpu, found| interval.sleep(now, cpu, found, Need::Every).as_micros();
         assert_eq!(microseconds(1.0, 0.0, 0), 50);

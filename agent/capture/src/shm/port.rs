@@ -13,18 +13,18 @@ use crate::tables::PortCells;
 
 /// PortNode follows the allocator's administration, at 0x100 on x86-64 and 0x110 on aarch64: it is
 /// found in the first page by its content.
-const FIRST: u64 = 0x40;
-const LAST: u64 = 0x1000;
+const FIRST_OFFSET: u64 = 0x40;
+const LAST_OFFSET: u64 = 0x1000;
 /// Fields of PortNode and of the ring's node.
-const CELLS: u64 = 12;
-const RING: u64 = 16;
+const CELLS_OFFSET: u64 = 12;
+const RING_OFFSET: u64 = 16;
 const PORT_ID: u64 = 20;
-const CAPACITY: u64 = 36;
+const CAPACITY_OFFSET: u64 = 36;
 const TOTAL_CELLS: u64 = 8;
 /// A cell that is not filled after this time stays unfilled: its writer died.
 const UNFILLED_NANOSECONDS: u64 = 100_000_000;
 /// Maximum number of attempts to read a ring without a concurrent write.
-const ATTEMPTS: usize = 3;
+const MAX_ATTEMPTS: usize = 3;
 /// Interval over which a port's rate is measured; each interval decays the peak by an eighth.
 const PACE_NANOSECONDS: u64 = 100_000_000;
 
@@ -44,8 +44,8 @@ pub struct Port {
     position: u32,
     shadow: Bounded<PortCells, Vec<Descriptor>>,
     unfilled_since: Option<u64>,
-    looked: u64,
-    pace: PeakRate,
+    last_polled: u64,
+    peak_rate: PeakRate,
     bytes: Vec<u8>,
 }
 
@@ -84,13 +84,13 @@ impl Port {
             position: 0,
             shadow: Bounded::default(),
             unfilled_since: None,
-            looked: now,
-            pace: PeakRate::default(),
+            last_polled: now,
+            peak_rate: PeakRate::default(),
             bytes: Vec::new(),
         };
         let mut before = port.write_position(source)?;
         let mut cells = Vec::new();
-        for _ in 0..ATTEMPTS {
+        for _ in 0..MAX_ATTEMPTS {
             cells.clear();
             port.cells(source, 0, layout.capacity, &mut cells)?;
             let after = port.write_position(source)?;
@@ -116,12 +116,12 @@ impl Port {
         now: u64,
         found: &mut Vec<Descriptor>,
     ) -> Option<PortPoll> {
-        let elapsed = now.saturating_sub(std::mem::replace(&mut self.looked, now));
+        let elapsed = now.saturating_sub(std::mem::replace(&mut self.last_polled, now));
         let write = self.write_position(source)?;
         let capacity = self.layout.capacity;
         let mut ahead = self.layout.distance(self.position, write);
         let mut look = PortPoll {
-            is_uncertain: self.pace.may_lap(elapsed, capacity),
+            is_uncertain: self.peak_rate.may_have_lapped(elapsed, capacity),
             ..PortPoll::default()
         };
         if ahead == 0 {
@@ -158,7 +158,7 @@ impl Port {
             look.pushed += 1;
             self.position = self.layout.advance(self.position, 1);
         }
-        self.pace.count(look.pushed, now);
+        self.peak_rate.count(look.pushed, now);
         Some(look)
     }
 
@@ -200,7 +200,7 @@ impl Port {
 
 impl Layout {
     fn find<S: Source + ?Sized>(source: &S, number: u32) -> Option<Self> {
-        (FIRST..LAST)
+        (FIRST_OFFSET..LAST_OFFSET)
             .step_by(8)
             .find_map(|node| Self::at(source, node, number))
     }
@@ -209,9 +209,9 @@ impl Layout {
         if source.word(node + PORT_ID)? != number {
             return None;
         }
-        let capacity = source.word(node + CAPACITY)?;
-        let ring = u64::from(source.word(node + RING)?);
-        let cells = u64::from(source.word(node + CELLS)?);
+        let capacity = source.word(node + CAPACITY_OFFSET)?;
+        let ring = u64::from(source.word(node + RING_OFFSET)?);
+        let cells = u64::from(source.word(node + CELLS_OFFSET)?);
         let fits = (1..=PortCells::CAP as u32).contains(&capacity)
             && ring.is_multiple_of(4)
             && source.word(ring + TOTAL_CELLS)? == capacity;
@@ -241,7 +241,7 @@ impl Layout {
 impl PeakRate {
     /// Returns whether the ring may have wrapped around twice at the recent rate, which looks like
     /// no message.
-    fn may_lap(&self, elapsed: u64, capacity: u32) -> bool {
+    fn may_have_lapped(&self, elapsed: u64, capacity: u32) -> bool {
         let pushed = u128::from(self.peak) * u128::from(elapsed) / 1_000_000_000;
         pushed >= 2 * u128::from(capacity)
     }

@@ -13,13 +13,13 @@ use super::cell::Descriptor;
 use super::source::Source;
 
 /// Fields of BufferNode after the status word.
-const SIZE: u64 = 8;
-const DATA: u64 = 12;
+const SIZE_OFFSET: u64 = 8;
+const DATA_OFFSET: u64 = 12;
 /// Bits of the status word that hold the validity id.
-const VALIDITY: u64 = 0xff_ffff;
+const VALIDITY_MASK: u64 = 0xff_ffff;
 /// Size of one read, in bytes: an RTPS header, INFO_DST, INFO_TS and the head of a DATA or
 /// DATA_FRAG fit.
-const WINDOW: usize = 256;
+const WINDOW_BYTES: usize = 256;
 
 /// A message in a segment, valid at the time it was found.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
@@ -59,8 +59,8 @@ impl Buffer {
             length: 0,
         };
         let word = |at: u64| bytes[..].word(at).ok_or(Refusal::Malformed);
-        let (validity, size, data) = (word(0)?, word(SIZE)?, word(DATA)?);
-        if u64::from(validity) & VALIDITY != u64::from(descriptor.validity) {
+        let (validity, size, data) = (word(0)?, word(SIZE_OFFSET)?, word(DATA_OFFSET)?);
+        if u64::from(validity) & VALIDITY_MASK != u64::from(descriptor.validity) {
             return Err(Refusal::Expired);
         }
         // The other fields may belong to the next use of the buffer, if it has just begun.
@@ -81,8 +81,8 @@ impl Buffer {
     /// far is valid.
     #[must_use]
     pub fn is_valid<S: Source + ?Sized>(&self, source: &S) -> bool {
-        let status = source.long(self.node);
-        status.is_some_and(|status| status & VALIDITY == u64::from(self.validity))
+        let status = source.u64_at(self.node);
+        status.is_some_and(|status| status & VALIDITY_MASK == u64::from(self.validity))
     }
 
     /// Reads the whole message; returns `false` if the file ends before the message. Allocates at
@@ -108,7 +108,7 @@ pub struct Message<'a, S: ?Sized> {
 struct Window {
     start: u32,
     length: usize,
-    bytes: [u8; WINDOW],
+    bytes: [u8; WINDOW_BYTES],
 }
 
 impl<'a, S: Source + ?Sized> Message<'a, S> {
@@ -121,7 +121,7 @@ impl<'a, S: Source + ?Sized> Message<'a, S> {
             window: RefCell::new(Window {
                 start: 0,
                 length: 0,
-                bytes: [0; WINDOW],
+                bytes: [0; WINDOW_BYTES],
             }),
         }
     }
@@ -147,7 +147,7 @@ impl<S: Source + ?Sized> Bytes for Message<'_, S> {
             return Some(words);
         }
         let left = self.buffer.length.checked_sub(offset)?;
-        let length = usize::try_from(left).ok()?.min(WINDOW);
+        let length = usize::try_from(left).ok()?.min(WINDOW_BYTES);
         (window.start, window.length) = (offset, 0);
         let bytes = window.bytes.get_mut(..length)?;
         if self

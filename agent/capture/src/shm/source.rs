@@ -25,7 +25,7 @@ pub trait Source {
     }
 
     /// Reads a little-endian 64-bit word; `None` if its bytes do not exist.
-    fn long(&self, offset: u64) -> Option<u64> {
+    fn u64_at(&self, offset: u64) -> Option<u64> {
         let mut bytes = [0; 8];
         self.read(offset, &mut bytes)
             .then(|| u64::from_le_bytes(bytes))
@@ -127,7 +127,7 @@ mod tests {
         assert!(!file.read(9_000, &mut into));
         assert!(!file.read(u64::MAX - 10, &mut into));
         assert_eq!(file.word(0), Some(0x0707_0707));
-        assert_eq!(file.long(46), None);
+        assert_eq!(file.u64_at(46), None);
     }
 
     #[test]
@@ -163,7 +163,7 @@ mod tests {
         let bytes = [1, 2, 3, 4, 5, 6, 7, 8, 9];
         assert_eq!(bytes.word(5), Some(0x0908_0706));
         assert_eq!(bytes.word(6), None);
-        assert_eq!(bytes.long(1), Some(0x0908_0706_0504_0302));
+        assert_eq!(bytes.u64_at(1), Some(0x0908_0706_0504_0302));
         assert_eq!(bytes.word(u64::MAX), None);
     }
 }

@@ -34,20 +34,20 @@ const MAX_PER_URGENT_POLL: usize = 64;
 const PORTS_PER_URGENT_POLL: usize = 8;
 /// Number of bytes at the start of a message in which an announcement of its participant's nodes
 /// begins.
-const BEGIN: usize = 4096;
+const HEAD_BYTES: usize = 4096;
 /// Silence after which a port is polled less often, and the interval of those polls.
 const SILENT_AFTER: u64 = 2_000_000_000;
-const SILENT_EVERY: u64 = 10_000_000;
+const SILENT_POLL_INTERVAL: u64 = 10_000_000;
 /// Pause before another attempt to open a segment.
-const RETRY: u64 = 50_000_000;
+const RETRY_NANOSECONDS: u64 = 50_000_000;
 /// Interval of listing directories.
-const LIST_EVERY: u64 = 100_000_000;
+const LIST_INTERVAL: u64 = 100_000_000;
 /// Interval of polling a port that is not initialized yet.
-const TRY_EVERY: u64 = 1_000_000;
-const FIND_EVERY: u64 = 1_000_000_000;
-const URGENT_FIND_EVERY: u64 = 10_000_000_000;
+const OPEN_RETRY_INTERVAL: u64 = 1_000_000;
+const FIND_INTERVAL: u64 = 1_000_000_000;
+const URGENT_FIND_INTERVAL: u64 = 10_000_000_000;
 /// Interval between two measurements of the directories' use.
-const JUDGE_EVERY: u64 = 5_000_000_000;
+const MEMORY_USE_INTERVAL: u64 = 5_000_000_000;
 
 /// The open files and the read positions.
 pub struct Tap {
@@ -55,7 +55,7 @@ pub struct Tap {
     /// Ports, by number.
     ports: Bounded<Ports, Vec<Open>>,
     /// Ports that are listed but not initialized yet.
-    unborn: Vec<(PortKey, PathBuf)>,
+    uninitialized: Vec<(PortKey, PathBuf)>,
     /// Ports of dead processes, with their inodes. They are tried again after the next search.
     abandoned: Bounded<AbandonedPorts, HashSet<(PortKey, u64)>>,
     segments: Bounded<Segments, HashMap<SegmentKey, Segment>>,
@@ -63,25 +63,25 @@ pub struct Tap {
     /// The rules and the interest map.
     pub classifier: MessageClassifier,
     /// Whether the next poll is urgent: slow work is postponed.
-    pub is_hurried: bool,
+    pub is_urgent: bool,
     /// Whether every message is needed: silent ports are polled as often as others.
-    pub misses_nothing: bool,
+    pub needs_every_message: bool,
     /// The wall clock, in nanoseconds since the Unix epoch.
-    calendar: Box<dyn FnMut() -> u64>,
+    wall_clock: Box<dyn FnMut() -> u64>,
     counters: Counters,
     opened: u64,
-    met: bool,
+    discovery_seen: bool,
     now: u64,
-    listed: u64,
-    tried: u64,
-    found: u64,
-    judged: u64,
+    last_listing: u64,
+    last_open_attempt: u64,
+    last_search: u64,
+    last_memory_use: u64,
     announced: Vec<Descriptor>,
     latest: HashMap<(SegmentId, u32), usize>,
     records: Vec<Record>,
     allowance: CpuAllowance,
     /// Index of the port that is polled first.
-    turn: usize,
+    first_port: usize,
 }
 
 /// Counters of the tap.
@@ -143,46 +143,46 @@ enum Segment {
 struct Reading {
     monotonic: u64,
     /// Wall clock after the announcement was read, so never before the message was sent.
-    calendar: u64,
+    wall_time: u64,
     /// Whether the message was announced since the previous poll.
     is_timely: bool,
 }
 
 impl Tap {
-    /// Creates a tap without open files. `calendar` returns nanoseconds since the Unix epoch.
+    /// Creates a tap without open files. `wall_clock` returns nanoseconds since the Unix epoch.
     #[must_use]
-    pub fn new(directories: ShmDirectories, calendar: impl FnMut() -> u64 + 'static) -> Self {
+    pub fn new(directories: ShmDirectories, wall_clock: impl FnMut() -> u64 + 'static) -> Self {
         Self {
             directories,
             ports: Bounded::default(),
-            unborn: Vec::new(),
+            uninitialized: Vec::new(),
             abandoned: Bounded::default(),
             segments: Bounded::default(),
             remembered: RecentMessages::default(),
             classifier: MessageClassifier::default(),
-            is_hurried: false,
-            misses_nothing: false,
-            calendar: Box::new(calendar),
+            is_urgent: false,
+            needs_every_message: false,
+            wall_clock: Box::new(wall_clock),
             counters: Counters::default(),
             opened: 0,
-            met: false,
+            discovery_seen: false,
             now: 0,
-            listed: 0,
-            tried: 0,
-            found: 0,
-            judged: 0,
+            last_listing: 0,
+            last_open_attempt: 0,
+            last_search: 0,
+            last_memory_use: 0,
             announced: Vec::new(),
             latest: HashMap::new(),
             records: Vec::new(),
             allowance: CpuAllowance::default(),
-            turn: 0,
+            first_port: 0,
         }
     }
 
     /// Returns whether directories are listed at `now`; `false` if listing has used up its CPU
     /// share.
     pub fn may_list(&mut self, now: u64) -> bool {
-        self.allowance.is_left(now)
+        self.allowance.has_time_left(now)
     }
 
     /// Charges CPU time spent on listing directories and opening ports, in nanoseconds.
@@ -193,9 +193,9 @@ impl Tap {
     /// Makes the next poll list directories and poll every port, even silent ones. If no directory
     /// is known, the poll also searches for directories.
     pub fn expect_participant(&mut self) {
-        self.listed = 0;
+        self.last_listing = 0;
         if self.directories.directories.is_empty() {
-            self.found = 0;
+            self.last_search = 0;
         }
         for open in self.ports.iter_mut() {
             (open.due, open.busy) = (0, open.busy.max(self.now));
@@ -207,13 +207,13 @@ impl Tap {
         self.ports.clear();
         self.abandoned.clear();
         self.segments.clear();
-        (self.listed, self.found) = (0, 0);
+        (self.last_listing, self.last_search) = (0, 0);
     }
 
     /// Returns whether participants discovered each other since the last call: a port appeared, or
     /// an endpoint was announced.
     pub fn take_discovery_seen(&mut self) -> bool {
-        std::mem::take(&mut self.met)
+        std::mem::take(&mut self.discovery_seen)
     }
 
     /// Iterates over the observed directories and paths that reach them.
@@ -238,9 +238,9 @@ impl Tap {
     /// created file requires a poll. Returns `None` if a port exists or waits to be opened, or if
     /// the next poll is urgent.
     #[must_use]
-    pub fn idle(&self, now: u64) -> Option<u64> {
-        let is_idle = self.ports.is_empty() && self.unborn.is_empty() && !self.is_hurried;
-        is_idle.then(|| (self.found + FIND_EVERY).saturating_sub(now))
+    pub fn until_next_search(&self, now: u64) -> Option<u64> {
+        let is_idle = self.ports.is_empty() && self.uninitialized.is_empty() && !self.is_urgent;
+        is_idle.then(|| (self.last_search + FIND_INTERVAL).saturating_sub(now))
     }
 
     /// Returns the counters.
@@ -256,35 +256,37 @@ impl Tap {
         }
     }
 
-    /// Polls the ports that are due, up to a limit of messages, at `now` nanoseconds of the monotonic
-    /// clock; appends items of interest. Returns the number of announced messages.
+    /// Polls the ports that are due, up to a limit of messages, at `now` nanoseconds of the
+    /// monotonic clock; appends items of interest. Returns the number of announced messages.
     pub fn poll(&mut self, now: u64, found: &mut Vec<Item>) -> usize {
         self.now = now;
         self.classifier.refill(now);
-        let lists = now.saturating_sub(self.listed) >= LIST_EVERY || self.listed == 0;
-        let tries = !self.unborn.is_empty() && now.saturating_sub(self.tried) >= TRY_EVERY;
+        let lists =
+            now.saturating_sub(self.last_listing) >= LIST_INTERVAL || self.last_listing == 0;
+        let tries = !self.uninitialized.is_empty()
+            && now.saturating_sub(self.last_open_attempt) >= OPEN_RETRY_INTERVAL;
         if (lists || tries) && self.may_list(now) {
             let before = thread_cpu();
             if lists {
-                self.listed = now;
+                self.last_listing = now;
                 self.scan(now, found);
             } else {
                 self.attach(now, found);
             }
             self.spend(thread_cpu().saturating_sub(before));
         }
-        let most = if self.is_hurried {
+        let most = if self.is_urgent {
             MAX_PER_URGENT_POLL
         } else {
             MAX_PER_POLL
         };
-        let most_ports = match self.is_hurried && !self.misses_nothing {
+        let most_ports = match self.is_urgent && !self.needs_every_message {
             true => PORTS_PER_URGENT_POLL,
             false => usize::MAX,
         };
         let (mut announced, mut polled) = (0, 0);
         let ports = self.ports.len();
-        let first = std::mem::take(&mut self.turn);
+        let first = std::mem::take(&mut self.first_port);
         for step in 0..ports {
             let index = (first + step) % ports;
             if self.ports.get(index).is_some_and(|open| open.due <= now) {
@@ -292,7 +294,7 @@ impl Tap {
                 polled += 1;
                 if announced >= most || polled >= most_ports {
                     // A flood at one port must not starve the others.
-                    self.turn = index + 1;
+                    self.first_port = index + 1;
                     break;
                 }
             }
@@ -309,8 +311,8 @@ impl Tap {
         let look = open.port.poll(&open.file, now, &mut announced);
         let number = announced.len();
         let is_uncertain = look.is_some_and(|look| look.is_uncertain);
-        let calendar = match number > 0 || is_uncertain {
-            true => (self.calendar)(),
+        let wall_time = match number > 0 || is_uncertain {
+            true => (self.wall_clock)(),
             false => 0,
         };
         match look {
@@ -319,14 +321,14 @@ impl Tap {
                     open.busy = now;
                 }
                 let is_silent = now.saturating_sub(open.busy) > SILENT_AFTER;
-                let is_resting = is_silent && !self.misses_nothing;
-                open.due = now + if is_resting { SILENT_EVERY } else { 0 };
+                let is_resting = is_silent && !self.needs_every_message;
+                open.due = now + if is_resting { SILENT_POLL_INTERVAL } else { 0 };
                 self.counters.announced += look.pushed;
                 self.counters.missed += look.overwritten;
                 self.counters.unfilled += look.unfilled;
                 if is_uncertain {
                     self.counters.uncertain += 1;
-                    found.push(Item::Uncertain(calendar));
+                    found.push(Item::Uncertain(wall_time));
                 }
             }
             None => {
@@ -342,7 +344,7 @@ impl Tap {
         latest.extend(directories.map(|(index, it)| ((it.segment, it.node), index)));
         let reading = Reading {
             monotonic: now,
-            calendar,
+            wall_time,
             is_timely: true,
         };
         for (index, descriptor) in announced.drain(..).enumerate() {
@@ -392,7 +394,7 @@ impl Tap {
             }
         };
         let template = Record {
-            time: reading.calendar,
+            time: reading.wall_time,
             destination_port: u16::try_from(port).unwrap_or(0),
             flags: flag::SHM,
             ..Record::default()
@@ -417,13 +419,13 @@ impl Tap {
         if judgement == MessageVerdict::Captured {
             self.counters.captured += 1;
             // Samples that are read do not indicate a new participant.
-            let may_be_new = !(self.misses_nothing && self.classifier.is_wanted);
-            self.met |= may_be_new
+            let may_be_new = !(self.needs_every_message && self.classifier.is_wanted);
+            self.discovery_seen |= may_be_new
                 && self.classifier.announces
                 && (self.classifier.is_builtin || may_announce_nodes(&bytes));
             self.counters.captured_bytes += bytes.len() as u64;
             found.push(Item::Message {
-                time: reading.calendar,
+                time: reading.wall_time,
                 port: template.destination_port,
                 bytes,
             });
@@ -440,7 +442,9 @@ impl Tap {
     fn open_segment(&mut self, key: SegmentKey, now: u64) {
         match self.segments.get(&key) {
             Some(Segment::Open(..)) => return,
-            Some(Segment::Missing(since)) if now.saturating_sub(*since) < RETRY => return,
+            Some(Segment::Missing(since)) if now.saturating_sub(*since) < RETRY_NANOSECONDS => {
+                return;
+            }
             _ => {}
         }
         if self.segments.is_full() && !self.segments.contains_key(&key) {
@@ -462,23 +466,25 @@ impl Tap {
 
     /// Opens new files and closes files that are gone or were replaced.
     fn scan(&mut self, now: u64, found: &mut Vec<Item>) {
-        let every = if self.is_hurried {
-            URGENT_FIND_EVERY
+        let every = if self.is_urgent {
+            URGENT_FIND_INTERVAL
         } else {
-            FIND_EVERY
+            FIND_INTERVAL
         };
-        let is_lost = self.found == 0 || !self.directories.are_reachable();
-        let finds = is_lost || now.saturating_sub(self.found) >= every;
+        let is_lost = self.last_search == 0 || !self.directories.are_reachable();
+        let finds = is_lost || now.saturating_sub(self.last_search) >= every;
         if finds {
-            self.found = now;
-            if !is_lost && self.ports.is_empty() && self.unborn.is_empty() {
+            self.last_search = now;
+            if !is_lost && self.ports.is_empty() && self.uninitialized.is_empty() {
                 self.directories.find_new();
             } else {
                 self.directories.find();
             }
             self.abandoned.clear();
-            if now.saturating_sub(self.judged) >= JUDGE_EVERY || self.judged == 0 {
-                self.judged = now;
+            if now.saturating_sub(self.last_memory_use) >= MEMORY_USE_INTERVAL
+                || self.last_memory_use == 0
+            {
+                self.last_memory_use = now;
                 self.counters.memory_use = self.directories.memory_use();
             }
         }
@@ -502,7 +508,7 @@ impl Tap {
                 Segment::Missing(_) => false,
             });
         let known: HashSet<_> = self.ports.iter().map(|open| open.key).collect();
-        self.unborn.clear();
+        self.uninitialized.clear();
         for (id, directory) in directories {
             for (name, inode) in &directory.files {
                 let Name::Port(generation, number) = name else {
@@ -510,7 +516,7 @@ impl Tap {
                 };
                 let key = (*id, *generation, *number);
                 if !known.contains(&key) && !self.abandoned.contains(&(key, *inode)) {
-                    self.unborn
+                    self.uninitialized
                         .push((key, directory.path.join(name.file_name())));
                 }
             }
@@ -521,9 +527,9 @@ impl Tap {
     /// Opens ports that have been initialized. Their existing messages count only if the sending
     /// process lives: files of a killed process stay until another process reuses their names.
     fn attach(&mut self, now: u64, found: &mut Vec<Item>) {
-        self.tried = now;
+        self.last_open_attempt = now;
         let mut attached = Vec::new();
-        for (key, path) in std::mem::take(&mut self.unborn) {
+        for (key, path) in std::mem::take(&mut self.uninitialized) {
             let Ok(file) = SharedFile::open(&path) else {
                 continue;
             };
@@ -534,7 +540,7 @@ impl Tap {
             let (_, _, number) = key;
             let Some((port, backlog)) = Port::attach(&file, number, now) else {
                 // The port is not initialized yet, or has an unknown layout.
-                self.unborn.push((key, path));
+                self.uninitialized.push((key, path));
                 continue;
             };
             let open = Open {
@@ -546,7 +552,7 @@ impl Tap {
             };
             let reading = Reading {
                 monotonic: now,
-                calendar: (self.calendar)(),
+                wall_time: (self.wall_clock)(),
                 is_timely: false,
             };
             // Messages are read first, because names are overwritten within 50 us.
@@ -577,7 +583,7 @@ impl Tap {
             let (_, _, number) = open.key;
             let at = self.ports.partition_point(|open| open.key.2 <= number);
             self.ports.insert(at, open);
-            self.met = true;
+            self.discovery_seen = true;
         }
     }
 
@@ -620,7 +626,7 @@ fn may_announce_nodes(message: &[u8]) -> bool {
         return false;
     };
     let participant = Guid::new(GuidPrefix(prefix), EntityId::PARTICIPANT).to_bytes();
-    let begin = message.get(20..message.len().min(BEGIN));
+    let begin = message.get(20..message.len().min(HEAD_BYTES));
     let mut guids = begin.unwrap_or_default().windows(participant.len());
     guids.any(|bytes| *bytes == participant)
 }

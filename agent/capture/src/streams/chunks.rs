@@ -7,7 +7,7 @@ use ros2probe_wire::frame::{Packet, Segment};
 use ros2probe_wire::host::{Piece, chunk};
 use ros2probe_wire::record::flag;
 
-use super::{Before, Chunk, Protocol};
+use super::{Chunk, MissingBefore, Protocol};
 
 /// Returns the direction to which a segment belongs.
 #[must_use]
@@ -41,7 +41,7 @@ impl<'a> Chunk<'a> {
             syn: segment.syn,
             end: segment.fin || segment.rst,
             boundary: None,
-            before: Before::Unknown,
+            before: MissingBefore::Unknown,
             bytes: segment.payload,
             length: segment.length,
         }
@@ -58,10 +58,10 @@ impl<'a> Chunk<'a> {
             false => Protocol::Zenoh,
         };
         let before = match (is(chunk::LOST), is(chunk::OVER_BUDGET), is(chunk::SKIPPED)) {
-            (true, ..) => Before::Lost,
-            (_, true, _) => Before::OverBudget,
-            (.., true) => Before::Skipped,
-            _ => Before::Unknown,
+            (true, ..) => MissingBefore::Lost,
+            (_, true, _) => MissingBefore::OverBudget,
+            (.., true) => MissingBefore::Skipped,
+            _ => MissingBefore::Unknown,
         };
         Self {
             time,

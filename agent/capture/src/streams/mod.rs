@@ -30,7 +30,7 @@ use ros2probe_wire::zenoh::PORT;
 use ros2probe_wire::{GuidPrefix, Timestamp};
 
 pub use chunks::{flow, flow_of};
-use stream::{Event, Stream, Took};
+use stream::{Event, Stream, TakeResult};
 
 /// Interval at which segments that wait are examined.
 const EXAMINATION_INTERVAL: Duration = Duration::from_millis(100);
@@ -51,7 +51,7 @@ pub struct Chunk<'a> {
     /// The protocol, if the source knows that a batch or frame begins here.
     pub boundary: Option<Protocol>,
     /// What is known about missing bytes before the chunk.
-    pub before: Before,
+    pub before: MissingBefore,
     /// The captured bytes, which are the first ones of the chunk.
     pub bytes: &'a [u8],
     /// Length of the chunk in bytes.
@@ -105,7 +105,7 @@ pub enum Streamed<'a> {
 
 impl Streamed<'_> {
     /// Passes this to the model.
-    pub fn pass(&self, observer: &mut Observer) {
+    pub fn pass_to(&self, observer: &mut Observer) {
         match *self {
             Self::Zenoh(report) => observer.input(Input::Zenoh(report)),
             Self::Gap(destination, time) => observer.input(Input::StreamGap(destination, time)),
@@ -131,7 +131,7 @@ impl Streamed<'_> {
 
 /// What is known about missing bytes before a chunk.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Before {
+pub enum MissingBefore {
     /// Nothing is known: the bytes may arrive later.
     #[default]
     Unknown,
@@ -241,15 +241,15 @@ impl Streams {
         let (counters, flows) = (&mut self.counters, &mut self.flows);
         let mut pass = |event: Event<'_>| pass_on(flows, &id, chunk.time, &event, &mut report);
         let took = stream.take(chunk, counters, &mut pass);
-        while chunk.end && stream.waits() {
-            stream.give_up(counters, &mut pass);
+        while chunk.end && stream.is_waiting() {
+            stream.skip_missing(counters, &mut pass);
         }
         self.bytes.sub(before);
         self.bytes.add(stream.held());
         if chunk.end && (was_zenoh || is_zenoh(stream)) {
             pass(Event::Zenoh(StreamEvent::End));
         }
-        if took == Took::Tls {
+        if took == TakeResult::Tls {
             pass(Event::Zenoh(StreamEvent::Unseen(Unseen::Tls)));
         }
         if chunk.end {
@@ -309,7 +309,7 @@ impl Streams {
                 continue;
             }
             let before = stream.held();
-            stream.give_up(counters, &mut |event| {
+            stream.skip_missing(counters, &mut |event| {
                 pass_on(flows, id, now, &event, &mut report);
             });
             self.bytes.sub(before);

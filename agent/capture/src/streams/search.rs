@@ -12,7 +12,7 @@ use ros2probe_wire::zenoh_stream::{Beginning, Lanes, message};
 use crate::tables::SearchedBytes;
 
 /// Assessment of the collected bytes.
-pub enum Looks {
+pub enum Assessment {
     /// The bytes are batches, beginning with the first byte.
     Zenoh(Vec<u8>),
     /// The bytes are frames of RTPS, beginning with the first byte.
@@ -33,75 +33,77 @@ pub struct Search {
 
 impl Search {
     /// Returns the capacity for collected bytes, in bytes.
-    pub fn held(&self) -> usize {
+    pub fn held_bytes(&self) -> usize {
         self.held.capacity()
     }
 
     /// Adds the bytes of a segment. With `begins`, the first collected byte is the first of the
     /// connection.
-    pub fn add(&mut self, bytes: &[u8], length: usize, begins: bool, is_port: bool) -> Looks {
+    pub fn add(&mut self, bytes: &[u8], length: usize, begins: bool, is_port: bool) -> Assessment {
         let was_empty = self.held.is_empty();
         let is_whole = bytes.len() >= length;
         if begins {
             // The first bytes suffice to recognize TLS, and the programs pass on no more of it.
             let looks = match self.held.extend_from_slice(bytes) {
                 true => self.begin(is_port),
-                false => Looks::Other,
+                false => Assessment::Other,
             };
-            return self.settled(match looks {
-                Looks::Zenoh(_) | Looks::Rtps(_) | Looks::Undecided if !is_whole => Looks::Other,
+            return self.after_search(match looks {
+                Assessment::Zenoh(_) | Assessment::Rtps(_) | Assessment::Undecided if !is_whole => {
+                    Assessment::Other
+                }
                 looks => looks,
             });
         }
         if !is_whole || !self.held.extend_from_slice(bytes) {
             // Without all bytes no boundary can be found.
             self.held.take();
-            return Looks::Undecided;
+            return Assessment::Undecided;
         }
-        let looks = self.judge(is_port);
-        if was_empty || !matches!(looks, Looks::Other) {
-            return self.settled(looks);
+        let looks = self.assess(is_port);
+        if was_empty || !matches!(looks, Assessment::Other) {
+            return self.after_search(looks);
         }
         // The collected bytes began within a batch: this segment may begin with one.
         self.held.take();
         self.held.extend_from_slice(bytes);
-        let looks = self.judge(is_port);
-        self.settled(looks)
+        let looks = self.assess(is_port);
+        self.after_search(looks)
     }
 
-    fn settled(&mut self, looks: Looks) -> Looks {
-        if matches!(looks, Looks::Other) {
+    fn after_search(&mut self, looks: Assessment) -> Assessment {
+        if matches!(looks, Assessment::Other) {
             self.held.take();
         }
         looks
     }
 
     /// Assesses the first bytes of a connection.
-    fn begin(&mut self, is_port: bool) -> Looks {
+    fn begin(&mut self, is_port: bool) -> Assessment {
         if self.held.starts_with(&rtps_tcp::MAGIC) {
             return match self.held.first_chunk() {
                 Some(head) if FrameHeader::recognize(*head).is_some() => {
-                    Looks::Rtps(self.held.take())
+                    Assessment::Rtps(self.held.take())
                 }
-                Some(_) => Looks::Other,
-                None => Looks::Undecided,
+                Some(_) => Assessment::Other,
+                None => Assessment::Undecided,
             };
         }
         let Some(head) = self.held.first_chunk() else {
             return match self.held.get(2) {
-                Some(header) if header & message::ID != message::INIT => Looks::Other,
-                _ => Looks::Undecided,
+                Some(header) if header & message::ID != message::INIT => Assessment::Other,
+                _ => Assessment::Undecided,
             };
         };
         // The rest of an INIT may be in later segments.
         match Beginning::of(*head, u32::MAX, is_port) {
-            Beginning::Init | Beginning::OtherVersion => Looks::Zenoh(self.held.take()),
-            Beginning::Tls => Looks::Tls,
-            _ => Looks::Other,
+            Beginning::Init | Beginning::OtherVersion => Assessment::Zenoh(self.held.take()),
+            Beginning::Tls => Assessment::Tls,
+            _ => Assessment::Other,
         }
     }
 
-    fn judge(&mut self, is_port: bool) -> Looks {
+    fn assess(&mut self, is_port: bool) -> Assessment {
         let mut rest = &self.held[..];
         let beginning = match (rest.first_chunk(), rest.as_array()) {
             (Some(head), _) => Beginning::of(
@@ -113,25 +115,25 @@ impl Search {
             (None, None) => Beginning::Other,
         };
         if matches!(beginning, Beginning::Init | Beginning::KeepAlive) {
-            return Looks::Zenoh(self.held.take());
+            return Assessment::Zenoh(self.held.take());
         }
         let mut lanes = Lanes::new();
         while rest.len() > 2 {
             let Some((batch, after)) = Batch::split(rest) else {
                 return match may_be_batch(rest) {
-                    true => Looks::Undecided,
-                    false => Looks::Other,
+                    true => Assessment::Undecided,
+                    false => Assessment::Other,
                 };
             };
             if !continues(&mut lanes, batch) {
-                return Looks::Other;
+                return Assessment::Other;
             }
             if lanes.are_certain() {
-                return Looks::Zenoh(self.held.take());
+                return Assessment::Zenoh(self.held.take());
             }
             rest = after;
         }
-        Looks::Undecided
+        Assessment::Undecided
     }
 }
 

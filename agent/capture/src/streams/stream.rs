@@ -8,29 +8,29 @@ use ros2probe_model::graph::zenoh::StreamEvent;
 use ros2probe_wire::rtps_tcp::{self, FrameHeader};
 use ros2probe_wire::{GuidPrefix, Timestamp};
 
-use super::search::{self, Looks, Search};
-use super::{Before, Chunk, Counters, Protocol};
+use super::search::{self, Assessment, Search};
+use super::{Chunk, Counters, MissingBefore, Protocol};
 use crate::tables::{SegmentsAhead, SegmentsAheadBytes};
 
 /// Maximum distance of a segment from the next expected byte: the largest TCP window.
-const WINDOW: u32 = 1 << 30;
+const MAX_SEGMENT_DISTANCE: u32 = 1 << 30;
 /// Time after which missing bytes are given up. TCP sends them again earlier, but late if the
 /// receiver does not read.
-const WAIT: Duration = Duration::from_secs(10);
+const MISSING_BYTES_TIMEOUT: Duration = Duration::from_secs(10);
 /// Size of the length field before each batch of Zenoh, in bytes.
-const PREFIX: usize = 2;
+const LENGTH_PREFIX: usize = 2;
 /// Maximum number of bytes kept of a frame of RTPS. Payloads of a longer one are not read.
 pub const MAX_FRAME: usize = 4 << 20;
 /// Number of held bytes from which a frame may be shortened, and number of bytes that then remain.
-const MANY: usize = 256 << 10;
-const KEPT: usize = 4 << 10;
+const MIN_SHORTENED_BYTES: usize = 256 << 10;
+const KEPT_FRAME_BYTES: usize = 4 << 10;
 /// Maximum number of consecutive batches without a message. Zenoh sends one when it drops the rest
 /// of a message. More of them are zeros of other data.
 const MAX_EMPTY: usize = 64;
 
 /// Result of taking a chunk.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub enum Took {
+pub enum TakeResult {
     /// The chunk was read, or waits for earlier bytes.
     Chunk,
     /// The connection appears to be one of another protocol.
@@ -91,7 +91,7 @@ struct Ahead {
     sequence_number: u32,
     length: u32,
     boundary: Option<Protocol>,
-    before: Before,
+    before: MissingBefore,
     bytes: Box<[u8]>,
 }
 
@@ -114,8 +114,8 @@ pub struct Stream {
     ahead_bytes: Sum<SegmentsAheadBytes>,
     /// When the first segment began to wait.
     waiting_since: Timestamp,
-    /// The protocol whose batches or frames were read in the stream. TLS on a port of Zenoh counts as
-    /// Zenoh.
+    /// The protocol whose batches or frames were read in the stream. TLS on a port of Zenoh counts
+    /// as Zenoh.
     protocol: Option<Protocol>,
     is_zenoh_port: bool,
 }
@@ -152,19 +152,19 @@ impl Stream {
     /// Returns the number of held bytes.
     pub fn held(&self) -> usize {
         let partial = match &self.position {
-            Position::Searching(search) | Position::Beginning(search) => search.held(),
+            Position::Searching(search) | Position::Beginning(search) => search.held_bytes(),
             Position::Batch(partial) => partial.captured.capacity(),
             Position::Other => 0,
         };
         partial + self.ahead_bytes.used()
     }
 
-    /// Drops most of the held bytes of an unfinished batch or frame. Its boundary stays known, so only
-    /// its payload is not read. Returns whether many bytes were dropped.
+    /// Drops most of the held bytes of an unfinished batch or frame. Its boundary stays known, so
+    /// only its payload is not read. Returns whether many bytes were dropped.
     pub fn shorten(&mut self) -> bool {
         match &mut self.position {
-            Position::Batch(partial) if partial.captured.capacity() > MANY => {
-                partial.captured.truncate(KEPT);
+            Position::Batch(partial) if partial.captured.capacity() > MIN_SHORTENED_BYTES => {
+                partial.captured.truncate(KEPT_FRAME_BYTES);
                 partial.captured.shrink_to_fit();
                 true
             }
@@ -173,13 +173,13 @@ impl Stream {
     }
 
     /// Returns whether segments wait for missing ones.
-    pub fn waits(&self) -> bool {
+    pub fn is_waiting(&self) -> bool {
         !self.ahead.is_empty()
     }
 
     /// Returns whether segments have waited too long.
     pub fn has_waited(&self, now: Timestamp) -> bool {
-        !self.ahead.is_empty() && now > self.waiting_since + WAIT
+        !self.ahead.is_empty() && now > self.waiting_since + MISSING_BYTES_TIMEOUT
     }
 
     /// Reads a chunk, or keeps it until the bytes before it have arrived.
@@ -188,36 +188,36 @@ impl Stream {
         chunk: &Chunk<'_>,
         counters: &mut Counters,
         report: &mut impl FnMut(Event<'_>),
-    ) -> Took {
+    ) -> TakeResult {
         let start = chunk.sequence_number.wrapping_add(u32::from(chunk.syn));
         if chunk.syn {
             report(Event::Zenoh(StreamEvent::Begin));
         }
         if matches!(self.position, Position::Other) && chunk.boundary.is_none() {
             self.next = start.wrapping_add(chunk.length);
-            return Took::Other;
+            return TakeResult::Other;
         }
         // Flags are about the bytes before a later byte.
-        let is_old = start.wrapping_sub(self.next) >= WINDOW;
+        let is_old = start.wrapping_sub(self.next) >= MAX_SEGMENT_DISTANCE;
         match chunk.before {
             _ if is_old => {}
-            Before::Lost => self.lost(start, counters, report),
+            MissingBefore::Lost => self.lost(start, counters, report),
             before if self.ahead.is_empty() => self.skip(before, start, counters, report),
             _ => {}
         }
         let distance = start.wrapping_sub(self.next);
-        if distance != 0 && distance < WINDOW {
+        if distance != 0 && distance < MAX_SEGMENT_DISTANCE {
             if self.ahead.is_empty() {
                 self.waiting_since = chunk.time;
             }
-            self.keep(start, chunk);
+            self.hold(start, chunk);
             let is_full = self.ahead.is_full() || self.ahead_bytes.is_exceeded();
             if is_full || self.has_waited(chunk.time) {
-                self.give_up(counters, report);
-            } else if chunk.before != Before::Unknown {
+                self.skip_missing(counters, report);
+            } else if chunk.before != MissingBefore::Unknown {
                 self.catch_up(counters, report);
             }
-            return Took::Chunk;
+            return TakeResult::Chunk;
         }
         let took = self.read(
             start,
@@ -227,14 +227,14 @@ impl Stream {
             counters,
             report,
         );
-        if took == Took::Chunk {
+        if took == TakeResult::Chunk {
             self.catch_up(counters, report);
         }
         took
     }
 
     /// Gives up the missing bytes and continues with the segments that wait.
-    pub fn give_up(&mut self, counters: &mut Counters, report: &mut impl FnMut(Event<'_>)) {
+    pub fn skip_missing(&mut self, counters: &mut Counters, report: &mut impl FnMut(Event<'_>)) {
         let Some(first) = self.ahead.front() else {
             return;
         };
@@ -273,21 +273,21 @@ impl Stream {
     /// Continues at a later byte, if whole batches before it were left out on purpose.
     fn skip(
         &mut self,
-        before: Before,
+        before: MissingBefore,
         start: u32,
         counters: &mut Counters,
         report: &mut impl FnMut(Event<'_>),
     ) {
-        if before == Before::OverBudget {
+        if before == MissingBefore::OverBudget {
             self.gap(counters, report);
         }
-        let is_left_out = matches!(before, Before::Skipped | Before::OverBudget);
-        if is_left_out && start.wrapping_sub(self.next) < WINDOW {
+        let is_left_out = matches!(before, MissingBefore::Skipped | MissingBefore::OverBudget);
+        if is_left_out && start.wrapping_sub(self.next) < MAX_SEGMENT_DISTANCE {
             self.next = start;
         }
     }
 
-    fn keep(&mut self, start: u32, chunk: &Chunk<'_>) {
+    fn hold(&mut self, start: u32, chunk: &Chunk<'_>) {
         let distance = start.wrapping_sub(self.next);
         let next = self.next;
         let position = self
@@ -310,7 +310,7 @@ impl Stream {
             let (start, before) = (first.sequence_number, first.before);
             self.skip(before, start, counters, report);
             let distance = start.wrapping_sub(self.next);
-            if distance != 0 && distance < WINDOW {
+            if distance != 0 && distance < MAX_SEGMENT_DISTANCE {
                 break;
             }
             let Some(first) = self.ahead.pop_front() else {
@@ -332,11 +332,11 @@ impl Stream {
         boundary: Option<Protocol>,
         counters: &mut Counters,
         report: &mut impl FnMut(Event<'_>),
-    ) -> Took {
+    ) -> TakeResult {
         let repeated = self.next.wrapping_sub(start).min(length);
         counters.retransmitted_bytes += u64::from(repeated);
         if repeated == length {
-            return Took::Chunk;
+            return TakeResult::Chunk;
         }
         self.next = start.wrapping_add(length);
         let skipped = usize::try_from(repeated).unwrap_or(usize::MAX);
@@ -361,7 +361,7 @@ impl Stream {
         length: usize,
         counters: &mut Counters,
         report: &mut impl FnMut(Event<'_>),
-    ) -> Took {
+    ) -> TakeResult {
         match &mut self.position {
             Position::Batch(partial) => {
                 if !partial.read(bytes, length, counters, report) {
@@ -369,54 +369,57 @@ impl Stream {
                     self.position = Position::Searching(Search::default());
                     self.gap(counters, report);
                 }
-                Took::Chunk
+                TakeResult::Chunk
             }
             Position::Beginning(search) => {
                 match search.add(bytes, length, true, self.is_zenoh_port) {
-                    Looks::Zenoh(held) => {
-                        self.found(Protocol::Zenoh, &held, held.len(), counters, report);
+                    Assessment::Zenoh(held) => {
+                        self.read_found(Protocol::Zenoh, &held, held.len(), counters, report);
                     }
-                    Looks::Rtps(held) => {
-                        self.found(Protocol::Rtps, &held, held.len(), counters, report);
+                    Assessment::Rtps(held) => {
+                        self.read_found(Protocol::Rtps, &held, held.len(), counters, report);
                     }
-                    Looks::Undecided => {}
-                    Looks::Tls => {
+                    Assessment::Undecided => {}
+                    Assessment::Tls => {
                         self.position = Position::Other;
                         self.protocol = Some(Protocol::Zenoh);
-                        return Took::Tls;
+                        return TakeResult::Tls;
                     }
-                    Looks::Other => {
+                    Assessment::Other => {
                         self.position = Position::Other;
-                        return Took::Other;
+                        return TakeResult::Other;
                     }
                 }
-                Took::Chunk
+                TakeResult::Chunk
             }
             Position::Searching(search) => {
                 if let Some(at) = search::frame(bytes) {
                     let rest = bytes.get(at..).unwrap_or_default();
-                    self.found(Protocol::Rtps, rest, length - at, counters, report);
-                    return Took::Chunk;
+                    self.read_found(Protocol::Rtps, rest, length - at, counters, report);
+                    return TakeResult::Chunk;
                 }
                 if self.protocol == Some(Protocol::Rtps) {
-                    return Took::Chunk;
+                    return TakeResult::Chunk;
                 }
                 counters.unsynchronized_bytes += length as u64;
-                if let Looks::Zenoh(held) = search.add(bytes, length, false, self.is_zenoh_port) {
+                if let Assessment::Zenoh(held) =
+                    search.add(bytes, length, false, self.is_zenoh_port)
+                {
                     let held_bytes = held.len();
                     counters.unsynchronized_bytes = counters
                         .unsynchronized_bytes
                         .saturating_sub(held_bytes as u64);
-                    self.found(Protocol::Zenoh, &held, held_bytes, counters, report);
+                    self.read_found(Protocol::Zenoh, &held, held_bytes, counters, report);
                 }
-                Took::Chunk
+                TakeResult::Chunk
             }
-            Position::Other => Took::Other,
+            Position::Other => TakeResult::Other,
         }
     }
 
-    /// Reads `length` bytes, of which the first ones were captured. They begin with a batch or frame.
-    fn found(
+    /// Reads `length` bytes, of which the first ones were captured. They begin with a batch or
+    /// frame.
+    fn read_found(
         &mut self,
         protocol: Protocol,
         bytes: &[u8],
@@ -482,7 +485,7 @@ impl Partial {
             (bytes, length) = (rest, length - count);
             match self.prefix() {
                 Prefix::Length(total) if self.arrived == total => {
-                    self.pass(total, counters, report);
+                    self.report_batch(total, counters, report);
                     if self.empty > MAX_EMPTY {
                         return false;
                     }
@@ -500,7 +503,12 @@ impl Partial {
     }
 
     /// Reports a complete batch or frame of `total` bytes.
-    fn pass(&mut self, total: usize, counters: &mut Counters, report: &mut impl FnMut(Event<'_>)) {
+    fn report_batch(
+        &mut self,
+        total: usize,
+        counters: &mut Counters,
+        report: &mut impl FnMut(Event<'_>),
+    ) {
         let length = total - self.prefix_len();
         let bytes = self.captured.get(self.prefix_len()..).unwrap_or_default();
         match self.protocol {
@@ -513,8 +521,8 @@ impl Partial {
             }
             Protocol::Rtps => {
                 counters.frames += 1;
-                // The header of a message has magic, version and vendor before the prefix (RTPS 2.5,
-                // 9.4.4). A control message has none.
+                // The header of a message has magic, version and vendor before the prefix (RTPS
+                // 2.5, 9.4.4). A control message has none.
                 let is_message = bytes.starts_with(b"RTPS");
                 let header = self.captured.first_chunk();
                 let header = header.and_then(|header| FrameHeader::read(*header));
@@ -535,7 +543,7 @@ impl Partial {
 
     const fn prefix_len(&self) -> usize {
         match self.protocol {
-            Protocol::Zenoh => PREFIX,
+            Protocol::Zenoh => LENGTH_PREFIX,
             Protocol::Rtps => rtps_tcp::HEADER_LEN,
         }
     }
@@ -544,7 +552,7 @@ impl Partial {
         let length = match self.protocol {
             Protocol::Zenoh => {
                 let prefix = self.captured.first_chunk();
-                prefix.map(|prefix| Some(PREFIX + usize::from(u16::from_le_bytes(*prefix))))
+                prefix.map(|prefix| Some(LENGTH_PREFIX + usize::from(u16::from_le_bytes(*prefix))))
             }
             Protocol::Rtps => {
                 let header = self.captured.first_chunk();

@@ -94,7 +94,7 @@ fn follow(segments: &[Segment]) -> (Reported, Counters) {
             syn: segment.syn,
             end: segment.end,
             boundary: None,
-            before: Before::Unknown,
+            before: MissingBefore::Unknown,
             bytes: &segment.bytes,
             length: u32::try_from(segment.bytes.len()).unwrap(),
         };
@@ -237,10 +237,10 @@ proptest! {
                 end: *end && !*syn,
                 boundary: is_boundary.then_some(Protocol::Zenoh),
                 before: [
-                    Before::Unknown,
-                    Before::Skipped,
-                    Before::OverBudget,
-                    Before::Lost,
+                    MissingBefore::Unknown,
+                    MissingBefore::Skipped,
+                    MissingBefore::OverBudget,
+                    MissingBefore::Lost,
                 ][bytes.len() % 4],
                 bytes,
                 length: u32::try_from(bytes.len()).unwrap() + more,
@@ -272,7 +272,7 @@ fn chunk(port: u16, sequence_number: u32, bytes: &[u8]) -> Chunk<'_> {
         syn: false,
         end: false,
         boundary: None,
-        before: Before::Unknown,
+        before: MissingBefore::Unknown,
         bytes,
         length: u32::try_from(bytes.len()).unwrap(),
     }
@@ -417,7 +417,7 @@ fn an_empty_batch_is_not_a_gap_but_a_run_of_zeros_is() {
 
 /// Reads batches, each in a chunk with this TCP sequence number. Returns the numbers of batches and
 /// gaps after each chunk.
-fn progress(streams: &mut Streams, chunks: &[(u32, Before)]) -> Vec<(usize, u64)> {
+fn progress(streams: &mut Streams, chunks: &[(u32, MissingBefore)]) -> Vec<(usize, u64)> {
     let mut reported = Reported::default();
     let chunks = chunks.iter().map(|(number, before)| {
         let chunk = Chunk {
@@ -435,11 +435,11 @@ fn progress(streams: &mut Streams, chunks: &[(u32, Before)]) -> Vec<(usize, u64)
 fn skipped_bytes_are_not_a_gap_but_lost_bytes_are() {
     let mut streams = Streams::default();
     let chunks = [
-        (1, Before::Unknown),
-        (1001, Before::Skipped),
-        (1007, Before::Unknown),
-        (2013, Before::Lost),
-        (2019, Before::Unknown),
+        (1, MissingBefore::Unknown),
+        (1001, MissingBefore::Skipped),
+        (1007, MissingBefore::Unknown),
+        (2013, MissingBefore::Lost),
+        (2019, MissingBefore::Unknown),
     ];
     assert_eq!(
         progress(&mut streams, &chunks),
@@ -454,15 +454,15 @@ fn skipped_bytes_are_not_a_gap_but_lost_bytes_are() {
 #[test]
 fn batches_over_the_budget_are_a_gap_between_batches() {
     let chunks = [
-        (1, Before::Unknown),
-        (1001, Before::OverBudget),
+        (1, MissingBefore::Unknown),
+        (1001, MissingBefore::OverBudget),
         // The chunk before this one is late, and so is what is known about the bytes before it.
-        (1019, Before::Unknown),
-        (1007, Before::Unknown),
-        (2013, Before::Unknown),
-        (2007, Before::OverBudget),
-        (1013, Before::Unknown),
-        (2019, Before::Skipped),
+        (1019, MissingBefore::Unknown),
+        (1007, MissingBefore::Unknown),
+        (2013, MissingBefore::Unknown),
+        (2007, MissingBefore::OverBudget),
+        (1013, MissingBefore::Unknown),
+        (2019, MissingBefore::Skipped),
     ];
     assert_eq!(
         progress(&mut Streams::default(), &chunks),

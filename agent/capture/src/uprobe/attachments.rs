@@ -22,9 +22,9 @@ use crate::tables::Libraries;
 use ros2probe_model::facts::bounded::Bounded;
 
 /// How long an unused library stays attached.
-pub const LINGER: Duration = Duration::from_secs(60);
+pub const DETACH_DELAY: Duration = Duration::from_secs(60);
 /// Pause before another attempt to attach to a library.
-pub const RETRY: Duration = Duration::from_secs(5);
+pub const RETRY_DELAY: Duration = Duration::from_secs(5);
 /// All known libraries, with a probe `P` in each.
 pub struct Attachments<P> {
     attach: Attach<P>,
@@ -142,11 +142,11 @@ impl<P> Attachments<P> {
         }
         for (process, used) in processes.using() {
             for mapped in &used.libraries {
-                self.meet(mapped, process, now, broker);
+                self.attach_mapped(mapped, process, now, broker);
             }
         }
         self.libraries.retain(|_, library| {
-            let is_used = library.is_installed || now - library.used < LINGER;
+            let is_used = library.is_installed || now - library.used < DETACH_DELAY;
             if !is_used && library.probe.is_ok() {
                 let library = library.path.display();
                 tracing::info!(%library, "uprobe detached: the library is no longer in use");
@@ -155,12 +155,12 @@ impl<P> Attachments<P> {
         });
     }
 
-    fn meet(&mut self, mapped: &Mapped, process: u32, now: Instant, broker: &mut Broker) {
+    fn attach_mapped(&mut self, mapped: &Mapped, process: u32, now: Instant, broker: &mut Broker) {
         let Mapped { id, path, .. } = mapped;
         let is_known = self
             .libraries
             .get(id)
-            .is_some_and(|known| known.probe.is_ok() || now - known.tried < RETRY);
+            .is_some_and(|known| known.probe.is_ok() || now - known.tried < RETRY_DELAY);
         if !is_known && (self.libraries.contains_key(id) || !self.libraries.is_full()) {
             let id = id.clone();
             let probe = (self.attach)(broker, Place::Mapped { process, id });

@@ -18,7 +18,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use self::search::{Facts, LibrarySearch};
-use super::breakpoints::Means;
+use super::breakpoints::AttachMethod;
 use super::filter::{Filter, FilterError, FilterSettings};
 use super::filter_reader::FilterReader;
 use super::reorder_buffer::ReorderBuffer;
@@ -32,7 +32,7 @@ use rustix::thread::{CapabilitySet, capabilities};
 
 /// Factor of the rings' sizes. A process can write a hundred thousand messages per second, ten
 /// times the rate of a socket. It writes a whole image at the speed of memory.
-const RINGS: usize = 4;
+const RING_FACTOR: usize = 4;
 /// Maximum size to which the ring of captured messages is enlarged, in bytes.
 const LARGE_RING: usize = 16 << 20;
 
@@ -65,10 +65,10 @@ pub enum UprobeError {
 /// Returns the capabilities that the broker needs, apart from those that load programs. They are
 /// for events of mapped files, and for reading mapped files of other users' processes. Perf events
 /// need the wider CAP_SYS_ADMIN on recent kernels.
-fn needed() -> [(CapabilitySet, &'static str); 2] {
-    let events = match Means::of_this_kernel() {
-        Means::Links => (CapabilitySet::PERFMON, "CAP_PERFMON"),
-        Means::PerfEvents => (CapabilitySet::SYS_ADMIN, "CAP_SYS_ADMIN"),
+fn required_capabilities() -> [(CapabilitySet, &'static str); 2] {
+    let events = match AttachMethod::of_this_kernel() {
+        AttachMethod::Links => (CapabilitySet::PERFMON, "CAP_PERFMON"),
+        AttachMethod::PerfEvents => (CapabilitySet::SYS_ADMIN, "CAP_SYS_ADMIN"),
     };
     [events, (CapabilitySet::SYS_PTRACE, "CAP_SYS_PTRACE")]
 }
@@ -76,8 +76,11 @@ fn needed() -> [(CapabilitySet, &'static str); 2] {
 /// Returns the capabilities that the broker can use: the required ones, and two for opening a
 /// mapped file that was replaced, or that only its user may read.
 #[must_use]
-pub fn useful() -> CapabilitySet {
-    let required: CapabilitySet = needed().iter().map(|(one, _)| *one).collect();
+pub fn usable_capabilities() -> CapabilitySet {
+    let required: CapabilitySet = required_capabilities()
+        .iter()
+        .map(|(one, _)| *one)
+        .collect();
     required | CapabilitySet::CHECKPOINT_RESTORE | CapabilitySet::DAC_READ_SEARCH
 }
 
@@ -95,13 +98,13 @@ pub(crate) fn broker(socket: &Path) -> Result<Broker, UprobeError> {
 
 /// Returns the names of required capabilities that `effective` lacks.
 #[must_use]
-pub fn lacking(effective: CapabilitySet) -> Vec<&'static str> {
+pub fn missing_capabilities(effective: CapabilitySet) -> Vec<&'static str> {
     // CAP_SYS_ADMIN includes CAP_PERFMON.
     let inherited = match effective.contains(CapabilitySet::SYS_ADMIN) {
         true => CapabilitySet::PERFMON,
         false => CapabilitySet::empty(),
     };
-    let needed = needed();
+    let needed = required_capabilities();
     let lacking = needed
         .iter()
         .filter(|(one, _)| !(effective | inherited).contains(*one));
@@ -111,7 +114,7 @@ pub fn lacking(effective: CapabilitySet) -> Vec<&'static str> {
 /// Returns the missing capabilities of the calling thread; empty if its capabilities cannot be
 /// read.
 pub(crate) fn missing() -> Vec<&'static str> {
-    capabilities(None).map_or_else(|_| Vec::new(), |sets| lacking(sets.effective))
+    capabilities(None).map_or_else(|_| Vec::new(), |sets| missing_capabilities(sets.effective))
 }
 
 /// The kernel programs and the thread that attaches them.
@@ -123,9 +126,9 @@ pub struct Uprobe {
 
 impl Uprobe {
     /// Loads the programs, and attaches them to installed libraries. With `on_demand`, they are
-    /// detached while no process starts and [`Self::want`] does not need them. `cgroup` restricts
-    /// them to processes of this control group. `broker` is the socket of the process that attaches
-    /// them.
+    /// detached while no process starts and [`Self::set_demand`] does not need them. `cgroup`
+    /// restricts them to processes of this control group. `broker` is the socket of the process
+    /// that attaches them.
     ///
     /// # Errors
     /// Fails if the programs may not be loaded, or if the kernel has no uprobes.
@@ -139,13 +142,13 @@ impl Uprobe {
         let within = cgroup.map(inode).transpose()?;
         let size = |bytes| u32::try_from(bytes).unwrap_or(u32::MAX >> 1);
         let settings = FilterSettings {
-            record_ring_bytes: size(record_ring_bytes.saturating_mul(RINGS)),
+            record_ring_bytes: size(record_ring_bytes.saturating_mul(RING_FACTOR)),
             piece_ring_bytes: size(
-                (ring_bytes.saturating_mul(RINGS)).min(ring_bytes.max(LARGE_RING)),
+                (ring_bytes.saturating_mul(RING_FACTOR)).min(ring_bytes.max(LARGE_RING)),
             ),
             ..FilterSettings::default()
         };
-        let loaded = Filter::load_uprobe(&settings, within, Means::of_this_kernel());
+        let loaded = Filter::load_uprobe(&settings, within, AttachMethod::of_this_kernel());
         let (filter, probes) = loaded.map_err(|error| match error {
             FilterError::Program(_) if within.is_some() => UprobeError::Scope(error),
             error => error.into(),
@@ -175,8 +178,8 @@ impl Uprobe {
 
     /// Sets whether every sample of a writer that may use shared memory is needed. The setting
     /// matters only if programs are attached on demand.
-    pub fn want(&self, wanted: bool) {
-        self.search.want(wanted);
+    pub fn set_demand(&self, wanted: bool) {
+        self.search.set_demand(wanted);
     }
 
     /// Returns whether the programs are needed, but not yet attached in all processes that can have

@@ -16,11 +16,11 @@ use crate::tables::MappedLibraries;
 use ros2probe_model::facts::bounded::Bounded;
 
 /// File that lists the holders of locks.
-const LOCKS: &str = "/proc/locks";
+const LOCKS_PATH: &str = "/proc/locks";
 /// Number of rounds in which a new process may still be loading libraries. Afterwards it is
-/// inspected only once in [`ROUNDS`] rounds.
+/// inspected only once in [`MAX_QUIET_ROUNDS`] rounds.
 const LOADING_ROUNDS: u32 = 10;
-const ROUNDS: u32 = 32;
+const MAX_QUIET_ROUNDS: u32 = 32;
 
 /// Files of the library, and of Fast DDS's shared memory, that a process maps.
 #[derive(Clone, Default, PartialEq, Eq, Debug)]
@@ -41,8 +41,8 @@ pub struct Processes {
 
 #[derive(Debug)]
 struct Process {
-    met: u32,
-    use_of_it: Use,
+    rounds: u32,
+    library_use: Use,
     /// Whether its maps cannot be read for lack of permission.
     is_closed: bool,
 }
@@ -83,8 +83,8 @@ impl Processes {
     #[cfg(test)]
     pub(super) fn of(process: u32, use_of_it: Use) -> Self {
         let known = Process {
-            met: 1,
-            use_of_it,
+            rounds: 1,
+            library_use: use_of_it,
             is_closed: false,
         };
         Self {
@@ -102,9 +102,9 @@ impl Processes {
         let in_scope = self.in_scope(broker)?;
         let is_asked = |pid: &u32| {
             self.known.get(pid).is_none_or(|known| {
-                known.met <= LOADING_ROUNDS
-                    || known.met % ROUNDS == pid % ROUNDS
-                    || all && !known.use_of_it.is_any()
+                known.rounds <= LOADING_ROUNDS
+                    || known.rounds % MAX_QUIET_ROUNDS == pid % MAX_QUIET_ROUNDS
+                    || all && !known.library_use.is_any()
             })
         };
         let asked: Vec<_> = in_scope.iter().copied().filter(is_asked).collect();
@@ -115,16 +115,16 @@ impl Processes {
         let closed: HashSet<_> = users.closed.into_iter().collect();
         for pid in in_scope {
             let known = before.remove(&pid);
-            let met = known.as_ref().map_or(0, |known| known.met);
+            let met = known.as_ref().map_or(0, |known| known.rounds);
             let mut process = match known {
                 Some(known) if !asked.contains(&pid) => known,
                 _ => Process {
-                    met,
-                    use_of_it: used.remove(&pid).map(Use::from).unwrap_or_default(),
+                    rounds: met,
+                    library_use: used.remove(&pid).map(Use::from).unwrap_or_default(),
                     is_closed: closed.contains(&pid),
                 },
             };
-            process.met = met.saturating_add(1);
+            process.rounds = met.saturating_add(1);
             self.known.insert(pid, process);
         }
         Ok(())
@@ -146,8 +146,8 @@ impl Processes {
         for (pid, used) in broker.users(self.library, &pids)?.used {
             let process = Process {
                 // The process may load further libraries.
-                met: 0,
-                use_of_it: used.into(),
+                rounds: 0,
+                library_use: used.into(),
                 is_closed: false,
             };
             self.known.insert(pid, process);
@@ -159,7 +159,7 @@ impl Processes {
     ///
     /// # Errors
     /// Fails if the broker cannot be reached.
-    pub(crate) fn meet(
+    pub(crate) fn inspect_mapped(
         &mut self,
         new: &NewMappings,
         broker: &mut Broker,
@@ -194,8 +194,8 @@ impl Processes {
     pub fn using(&self) -> impl Iterator<Item = (u32, &Use)> {
         self.known
             .iter()
-            .filter(|(_, process)| process.use_of_it.is_any())
-            .map(|(pid, process)| (*pid, &process.use_of_it))
+            .filter(|(_, process)| process.library_use.is_any())
+            .map(|(pid, process)| (*pid, &process.library_use))
     }
 
     /// Returns a process that cannot be inspected and may use Fast DDS, because it holds a lock of
@@ -204,7 +204,7 @@ impl Processes {
     pub fn closed(&self) -> Option<u32> {
         let mut closed = self.known.iter().filter(|(_, process)| process.is_closed);
         let first = closed.clone().next().map(|(pid, _)| *pid)?;
-        let Ok(locks) = fs::read_to_string(LOCKS) else {
+        let Ok(locks) = fs::read_to_string(LOCKS_PATH) else {
             return Some(first);
         };
         let holders: HashSet<u32> = locks.lines().filter_map(holder).collect();
@@ -214,8 +214,8 @@ impl Processes {
     }
 }
 
-/// Returns the holder of the lock in a line of [`LOCKS`], if Fast DDS takes this kind for its ports
-/// and segments.
+/// Returns the holder of the lock in a line of [`LOCKS_PATH`], if Fast DDS takes this kind for its
+/// ports and segments.
 fn holder(line: &str) -> Option<u32> {
     let mut fields = line.split_ascii_whitespace().skip(1);
     // An arrow precedes a lock that a process waits for.

@@ -22,21 +22,21 @@ use crate::bell::Bell;
 use crate::breakpoints::Attached;
 use crate::error_chain::{Reason, in_words};
 use crate::filter::Probes;
-use crate::mappings::{MappingEvents, NewMappings, UNCONCERNED};
+use crate::mappings::{MappingEvents, NewMappings, UNRELATED_DELAY};
 use crate::shm::directories::{Name, Scope, ShmDirectories};
 use crate::system::{DirectoryWatch, wait};
 use crate::threads::{Progress, Spawn, Task};
 
 /// Interval of inspecting processes without an event.
-const EVERY: Duration = Duration::from_secs(1);
+const INSPECTION_INTERVAL: Duration = Duration::from_secs(1);
 /// Time for which events accumulate: a starting participant creates several files together.
-const GATHER: Duration = Duration::from_millis(20);
+const EVENT_DELAY: Duration = Duration::from_millis(20);
 /// Time after the start of a process in which its names are announced, each once.
-const STARTING: Duration = Duration::from_secs(10);
+const STARTUP_TIME: Duration = Duration::from_secs(10);
 /// Time between resuming the polls of shared memory and detaching the probes.
-const OVERLAP: Duration = Duration::from_millis(400);
+const DETACH_OVERLAP: Duration = Duration::from_millis(400);
 /// Why nothing is attached on demand.
-const RESTING: &str =
+const IDLE_REASON: &str =
     "capture.shm.exact is auto, and no client reads samples of a topic in shared memory";
 /// Handle of the thread.
 pub struct LibrarySearch {
@@ -71,7 +71,7 @@ struct Shared {
     /// Whether any probe may be attached.
     attached: AtomicBool,
     /// Whether all processes have been inspected since the probes were last requested.
-    visited: AtomicBool,
+    has_inspected_all: AtomicBool,
     /// Whether probes are attached only while processes start, and while every message is needed.
     on_demand: bool,
     progress: Arc<Progress>,
@@ -80,10 +80,10 @@ struct Shared {
 
 impl Facts {
     /// Returns the facts while probes are attached on demand and not needed.
-    fn resting() -> Self {
+    fn idle() -> Self {
         Self {
             libraries: Vec::new(),
-            uncovered: Some(RESTING.to_owned()),
+            uncovered: Some(IDLE_REASON.to_owned()),
             has_inspected: true,
             is_resting: true,
         }
@@ -112,7 +112,7 @@ impl LibrarySearch {
         // A participant announces its names once, within a tenth of a second, so probes are
         // attached to installed libraries in advance.
         attachments.install(Library::FastDds, Instant::now(), &mut broker);
-        progress.rest();
+        progress.set_idle();
         let shared = Arc::new(Shared {
             facts: Mutex::default(),
             progress,
@@ -120,7 +120,7 @@ impl LibrarySearch {
             wanted: AtomicBool::new(!on_demand),
             bell: Bell::new().ok(),
             attached: AtomicBool::new(true),
-            visited: AtomicBool::default(),
+            has_inspected_all: AtomicBool::default(),
             on_demand,
             stop: AtomicBool::new(false),
         });
@@ -154,12 +154,12 @@ impl LibrarySearch {
 
     /// Sets whether every message is needed. The setting matters only if probes are attached on
     /// demand.
-    pub fn want(&self, wanted: bool) {
+    pub fn set_demand(&self, wanted: bool) {
         let shared = &self.shared;
         if !shared.on_demand || shared.wanted.swap(wanted, Ordering::AcqRel) == wanted {
             return;
         }
-        shared.visited.store(false, Ordering::Release);
+        shared.has_inspected_all.store(false, Ordering::Release);
         shared.ring();
     }
 
@@ -168,7 +168,7 @@ impl LibrarySearch {
     #[must_use]
     pub fn is_attaching(&self) -> bool {
         let shared = &self.shared;
-        shared.wanted.load(Ordering::Acquire) && !shared.visited.load(Ordering::Acquire)
+        shared.wanted.load(Ordering::Acquire) && !shared.has_inspected_all.load(Ordering::Acquire)
     }
 
     /// Returns whether any probe may be attached.
@@ -216,7 +216,7 @@ fn follow(shared: &Shared, attachments: Attachments<Attached>, scope: Scope, bro
         failed: None,
         mappings: None,
         without_mappings: None,
-        starting_until: Instant::now() + STARTING,
+        starting_until: Instant::now() + STARTUP_TIME,
     };
     let mut shared_memory = ShmDirectories::new(scope);
     // Without inotify, a starting participant is noticed within a second.
@@ -229,20 +229,20 @@ fn follow(shared: &Shared, attachments: Attachments<Attached>, scope: Scope, bro
         if !shared.wanted.load(Ordering::Acquire) && !is_starting {
             if shared.attached.load(Ordering::Acquire) {
                 // Polling of shared memory resumes before the probes are detached.
-                shared.report(Facts::resting());
-                std::thread::sleep(OVERLAP);
-                followed.rest();
+                shared.report(Facts::idle());
+                std::thread::sleep(DETACH_OVERLAP);
+                followed.detach_all();
                 shared.attached.store(false, Ordering::Release);
                 tracing::info!("no longer attached: no samples are read");
             }
             somebody_came = true;
             asked_all = None;
-            followed.wait_resting(shared);
+            followed.wait_for_demand(shared);
             continue;
         }
         shared.attached.store(true, Ordering::Release);
         let now = Instant::now();
-        let all = somebody_came && asked_all.is_none_or(|at| now - at >= EVERY);
+        let all = somebody_came && asked_all.is_none_or(|at| now - at >= INSPECTION_INTERVAL);
         if all {
             asked_all = Some(now);
         }
@@ -252,9 +252,9 @@ fn follow(shared: &Shared, attachments: Attachments<Attached>, scope: Scope, bro
             followed.find(true, now);
         }
         shared.report(followed.facts());
-        shared.visited.store(true, Ordering::Release);
+        shared.has_inspected_all.store(true, Ordering::Release);
         let Some(watch) = &mut watch else {
-            followed.wait_attaching(None, EVERY, shared);
+            followed.wait_and_attach(None, INSPECTION_INTERVAL, shared);
             continue;
         };
         shared_memory.find();
@@ -267,11 +267,11 @@ fn follow(shared: &Shared, attachments: Attachments<Attached>, scope: Scope, bro
             watch.add(new);
         }
         watched = directories;
-        followed.wait_attaching(None, GATHER, shared);
-        let is_created = followed.wait_attaching(Some(watch), EVERY, shared);
+        followed.wait_and_attach(None, EVENT_DELAY, shared);
+        let is_created = followed.wait_and_attach(Some(watch), INSPECTION_INTERVAL, shared);
         somebody_came = is_created && watch.created(|name| Name::parse(name).is_some());
     }
-    shared.progress.rest();
+    shared.progress.set_idle();
 }
 
 /// The processes, and the libraries that they use.
@@ -321,25 +321,25 @@ impl Followed {
     }
 
     /// Detaches from all libraries, so that the broker may end.
-    fn rest(&mut self) {
+    fn detach_all(&mut self) {
         self.attachments.clear();
-        self.broker.rest();
+        self.broker.disconnect();
     }
 
     /// Waits until a process maps a library, or every message is needed.
-    fn wait_resting(&mut self, shared: &Shared) {
+    fn wait_for_demand(&mut self, shared: &Shared) {
         let bell = shared.bell.iter().map(Bell::descriptor);
         let mapped = self.mappings.iter().flat_map(MappingEvents::descriptors);
         let descriptors: Vec<_> = bell.chain(mapped).collect();
-        shared.progress.rest();
-        let ready = wait(&descriptors, EVERY);
+        shared.progress.set_idle();
+        let ready = wait(&descriptors, INSPECTION_INTERVAL);
         shared.progress.step();
-        shared.bell.iter().for_each(Bell::silence);
+        shared.bell.iter().for_each(Bell::drain);
         let new = self.take_mapped();
         if new.is_incomplete || self.processes.are_in_scope(&new.processes) {
-            self.starting_until = Instant::now() + STARTING;
+            self.starting_until = Instant::now() + STARTUP_TIME;
         } else if matches!(ready, Ok(Some(_))) {
-            std::thread::sleep(UNCONCERNED);
+            std::thread::sleep(UNRELATED_DELAY);
         }
     }
 
@@ -354,7 +354,7 @@ impl Followed {
 
     /// Waits at most `limit` for a created file, and returns whether one was created. Attaches to
     /// libraries that processes map in that time.
-    fn wait_attaching(
+    fn wait_and_attach(
         &mut self,
         watch: Option<&DirectoryWatch>,
         limit: Duration,
@@ -369,7 +369,7 @@ impl Followed {
             let created = watch.map(AsFd::as_fd);
             let mapped = self.mappings.iter().flat_map(MappingEvents::descriptors);
             let descriptors: Vec<_> = created.into_iter().chain(mapped).collect();
-            shared.progress.rest();
+            shared.progress.set_idle();
             let ready = wait(&descriptors, rest);
             shared.progress.step();
             match ready {
@@ -383,12 +383,12 @@ impl Followed {
     fn attach_mapped(&mut self, shared: &Shared) {
         let new = self.take_mapped();
         if self.processes.are_in_scope(&new.processes) {
-            self.starting_until = Instant::now() + STARTING;
+            self.starting_until = Instant::now() + STARTUP_TIME;
         }
-        if let Err(error) = self.processes.meet(&new, &mut self.broker) {
+        if let Err(error) = self.processes.inspect_mapped(&new, &mut self.broker) {
             self.failed = Some(in_words(&error));
         } else if !new.is_incomplete && new.processes.is_empty() {
-            std::thread::sleep(UNCONCERNED);
+            std::thread::sleep(UNRELATED_DELAY);
             return;
         }
         let now = Instant::now();
@@ -409,7 +409,7 @@ impl Shared {
         let mut known = self.facts.lock().unwrap_or_else(PoisonError::into_inner);
         if known.uncovered != facts.uncovered {
             match &facts.uncovered {
-                Some(reason) if reason == RESTING => {}
+                Some(reason) if reason == IDLE_REASON => {}
                 Some(reason) => tracing::warn!(reason, "shared memory is sampled"),
                 None => tracing::info!("every message into shared memory is seen"),
             }
@@ -468,10 +468,10 @@ mod tests {
     use std::fs;
     use std::os::fd::AsRawFd as _;
 
-    use super::super::attachments::{LINGER, RETRY};
+    use super::super::attachments::{DETACH_DELAY, RETRY_DELAY};
     use super::super::processes::Use;
     use super::*;
-    use crate::breakpoints::Means;
+    use crate::breakpoints::AttachMethod;
     use crate::filter::{Filter, FilterSettings};
     use crate::tables::tests::assert_driven;
     use crate::tables::{Libraries, MappedLibraries};
@@ -507,13 +507,16 @@ mod tests {
         assert_driven::<MappedLibraries>();
         let process = std::process::id();
         let all = Processes::of(process, used.clone());
-        let (_filter, probes) =
-            Filter::load_uprobe(&FilterSettings::default(), None, Means::of_this_kernel())
-                .expect("loading the kernel filter needs root: run the tests with sudo");
+        let (_filter, probes) = Filter::load_uprobe(
+            &FilterSettings::default(),
+            None,
+            AttachMethod::of_this_kernel(),
+        )
+        .expect("loading the kernel filter needs root: run the tests with sudo");
         let mut attachments = attachments(probes, Arc::default());
         let (start, broker) = (Instant::now(), &mut Broker::here());
         attachments.follow(&all, start, broker);
-        attachments.follow(&all, start + RETRY, broker);
+        attachments.follow(&all, start + RETRY_DELAY, broker);
         let facts = super::facts(&attachments, &all, None);
         assert_driven::<Libraries>();
         let refused = facts.libraries.iter().find_map(|each| each.refused.clone());
@@ -527,9 +530,9 @@ mod tests {
         // The last library has no probe. It gets one after the first library is detached.
         used.libraries.remove(0);
         let fewer = Processes::of(process, used);
-        let later = start + RETRY + LINGER + EVERY;
+        let later = start + RETRY_DELAY + DETACH_DELAY + INSPECTION_INTERVAL;
         attachments.follow(&fewer, later, broker);
-        attachments.follow(&fewer, later + EVERY, broker);
+        attachments.follow(&fewer, later + INSPECTION_INTERVAL, broker);
         let facts = super::facts(&attachments, &fewer, None);
         assert_eq!(facts.libraries.len(), Libraries::CAP);
         assert_eq!(facts.uncovered, None);

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Result, ensure};
 use ros2probe_attach::library;
-use ros2probe_capture::breakpoints::{Attached, Means};
+use ros2probe_capture::breakpoints::{AttachMethod, Attached};
 use ros2probe_capture::filter::{Filter, FilterSettings, Form, Probes};
 use ros2probe_capture::piece_assembler::PieceAssembler;
 use ros2probe_testing::forged::{SAMPLES_WRITER, Talker};
@@ -27,7 +27,7 @@ const PATIENCE: Duration = Duration::from_secs(10);
 const EXACT: u16 = flag::SHM | flag::EXACT;
 
 /// A process that passes messages, a filter that observes it, and the participant that it imitates.
-struct Handing {
+struct SharedMemorySender {
     filter: Filter,
     probe: Option<Attached>,
     _probes: Probes,
@@ -37,13 +37,13 @@ struct Handing {
     talker: Talker,
 }
 
-impl Handing {
-    fn new(form: Form) -> Result<Handing> {
-        Self::by(Means::of_this_kernel(), form)
+impl SharedMemorySender {
+    fn new(form: Form) -> Result<SharedMemorySender> {
+        Self::by(AttachMethod::of_this_kernel(), form)
     }
 
-    fn by(means: Means, form: Form) -> Result<Handing> {
-        let host = Namespace::alone()?;
+    fn by(means: AttachMethod, form: Form) -> Result<SharedMemorySender> {
+        let host = Namespace::isolated()?;
         let within = File::open(host.cgroup())?.metadata()?.ino();
         let (mut filter, probes) =
             Filter::load_uprobe(&FilterSettings::default(), Some(within), means)?;
@@ -61,7 +61,7 @@ impl Handing {
         for budget in [Budget::CaptureBytes, Budget::Records] {
             filter.set_unknown_budget(budget, 1 << 20)?;
         }
-        Ok(Handing {
+        Ok(SharedMemorySender {
             filter,
             probe,
             _probes: probes,
@@ -78,7 +78,7 @@ impl Handing {
         hand(&mut self.sender, message, lengths)
     }
 
-    fn want(&mut self, verdict: Verdict) -> Result<()> {
+    fn set_verdict(&mut self, verdict: Verdict) -> Result<()> {
         let prefix = GuidPrefix(self.talker.prefix);
         let writer = Guid::new(prefix, EntityId(SAMPLES_WRITER));
         Ok(self.filter.set_interest(writer, Some(verdict))?)
@@ -148,8 +148,8 @@ fn cuts(form: Form, length: usize) -> Vec<Vec<usize>> {
 #[test]
 fn metered_records_equal_those_of_user_space() -> Result<()> {
     for form in [Form::Whole, Form::List] {
-        let mut handing = Handing::new(form)?;
-        handing.want(Verdict::Meter)?;
+        let mut handing = SharedMemorySender::new(form)?;
+        handing.set_verdict(Verdict::Meter)?;
         let mut expected = Vec::new();
         for size in [9, 10, 12, 13, 320] {
             for cut in cuts(
@@ -195,12 +195,12 @@ fn metered_records_equal_those_of_user_space() -> Result<()> {
 #[test]
 fn captured_messages_are_whole() -> Result<()> {
     for (means, form) in [
-        (Means::of_this_kernel(), Form::Whole),
-        (Means::of_this_kernel(), Form::List),
-        (Means::PerfEvents, Form::Whole),
-        (Means::PerfEvents, Form::List),
+        (AttachMethod::of_this_kernel(), Form::Whole),
+        (AttachMethod::of_this_kernel(), Form::List),
+        (AttachMethod::PerfEvents, Form::Whole),
+        (AttachMethod::PerfEvents, Form::List),
     ] {
-        let mut handing = Handing::by(means, form)?;
+        let mut handing = SharedMemorySender::by(means, form)?;
         let mut expected: Vec<Vec<u8>> = Vec::new();
         let introduction = handing.talker.introduction("talker");
         for message in introduction {
@@ -228,8 +228,8 @@ fn captured_messages_are_whole() -> Result<()> {
 #[test]
 fn messages_are_metered_while_the_ring_is_full() -> Result<()> {
     for form in [Form::Whole, Form::List] {
-        let mut handing = Handing::new(form)?;
-        handing.want(Verdict::Capture)?;
+        let mut handing = SharedMemorySender::new(form)?;
+        handing.set_verdict(Verdict::Capture)?;
         let numbers = 1..=30;
         for number in numbers.clone() {
             let message = handing.talker.message(SAMPLES_WRITER, number, &[7; 60_000]);
@@ -265,8 +265,8 @@ fn messages_are_metered_while_the_ring_is_full() -> Result<()> {
 #[test]
 fn messages_longer_than_datagrams_count_and_unreadable_ones_are_counted() -> Result<()> {
     for form in [Form::Whole, Form::List] {
-        let mut handing = Handing::new(form)?;
-        handing.want(Verdict::Meter)?;
+        let mut handing = SharedMemorySender::new(form)?;
+        handing.set_verdict(Verdict::Meter)?;
         // A length of 0 means that the submessage extends to the end.
         let mut long = handing.talker.message(SAMPLES_WRITER, 5, &vec![7; 40_000]);
         long.splice(22..24, [0, 0]);
@@ -283,7 +283,7 @@ fn messages_longer_than_datagrams_count_and_unreadable_ones_are_counted() -> Res
             .collect();
         assert_eq!(found, [(5, 140_000)]);
         // The message is too long to be captured.
-        handing.want(Verdict::Capture)?;
+        handing.set_verdict(Verdict::Capture)?;
         handing.hand(&long, &cut)?;
         let records = handing.records();
         let found = records.first();
@@ -306,8 +306,8 @@ fn messages_longer_than_datagrams_count_and_unreadable_ones_are_counted() -> Res
 
 #[test]
 fn messages_of_other_cgroups_and_messages_after_detaching_are_not_seen() -> Result<()> {
-    let mut handing = Handing::new(Form::Whole)?;
-    handing.want(Verdict::Meter)?;
+    let mut handing = SharedMemorySender::new(Form::Whole)?;
+    handing.set_verdict(Verdict::Meter)?;
     let message = handing.talker.sample(100);
     let elsewhere = handing.host.outside();
     let mut stranger = Process::start(&elsewhere, &handing.program, [""; 0])?;

@@ -171,7 +171,7 @@ fn payload(number: u32, size: usize) -> Vec<u8> {
 }
 
 /// Returns the addresses of sender and receiver on a veth pair and on loopback.
-fn ways(link: &Link) -> [(&Namespace, String, &Namespace, String); 4] {
+fn address_pairs(link: &Link) -> [(&Namespace, String, &Namespace, String); 4] {
     let (robot, monitor) = (&link.robot, &link.monitor);
     [
         (
@@ -189,7 +189,7 @@ fn ways(link: &Link) -> [(&Namespace, String, &Namespace, String); 4] {
 #[test]
 fn a_datagram_is_one_record_at_its_sender_and_one_at_its_receiver() -> Result<()> {
     let link = link()?;
-    for (host, from, other, to) in ways(&link) {
+    for (host, from, other, to) in address_pairs(&link) {
         let (mut out, mut into) = (
             Observed::new(Verdict::Meter)?,
             Observed::new(Verdict::Meter)?,
@@ -238,7 +238,7 @@ fn a_datagram_is_one_record_at_its_sender_and_one_at_its_receiver() -> Result<()
 #[test]
 fn captured_datagrams_of_all_sizes_arrive_byte_for_byte() -> Result<()> {
     let link = link()?;
-    for (host, from, other, to) in ways(&link) {
+    for (host, from, other, to) in address_pairs(&link) {
         let mut out = Observed::new(Verdict::Capture)?;
         let mut into = Observed::new(Verdict::Capture)?;
         let (sender, receiver) = (out.socket(host, &from)?, into.socket(other, &to)?);
@@ -274,7 +274,7 @@ fn captured_datagrams_of_all_sizes_arrive_byte_for_byte() -> Result<()> {
 
 #[test]
 fn two_sockets_in_a_multicast_group_yield_two_records_or_one_capture() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let mut observed = Observed::new(Verdict::Meter)?;
     let members = [
         member(&observed, &host, 7400)?,
@@ -329,8 +329,8 @@ fn two_sockets_in_a_multicast_group_yield_two_records_or_one_capture() -> Result
 }
 
 #[test]
-fn a_full_ring_loses_captures_and_nothing_else() -> Result<()> {
-    let host = Namespace::alone()?;
+fn a_full_ring_loses_only_captures() -> Result<()> {
+    let host = Namespace::isolated()?;
     let mut observed = Observed::new(Verdict::Capture)?;
     let sender = observed.socket(&host, "127.0.0.1:0")?;
     let receiver = observed.socket(&host, "127.0.0.1:0")?;
@@ -352,15 +352,15 @@ fn a_full_ring_loses_captures_and_nothing_else() -> Result<()> {
 }
 
 #[test]
-fn a_socket_in_use_stays_known_while_more_sockets_than_the_cap_come_and_go() -> Result<()> {
-    const AT_ONCE: usize = 500;
+fn a_socket_in_use_is_never_evicted_by_sockets_beyond_the_cap() -> Result<()> {
+    const BURST_LEN: usize = 500;
     use ros2probe_wire::time::SECOND;
     let cpus = std::thread::available_parallelism()?.get();
     ensure!(
         cpus >= 2,
         "others are not met on another CPU: run this on two"
     );
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let mut observed = Observed::new(Verdict::Meter)?;
     let bind = || UdpSocket::bind("127.0.0.1:0");
     let sender = netns::within(&host.network(), bind)??;
@@ -392,7 +392,11 @@ fn a_socket_in_use_stays_known_while_more_sockets_than_the_cap_come_and_go() -> 
     arrives(&mut observed, 0, &used)?;
     assert_eq!(forgotten(&observed), 0);
     while met < 2 * SOCKET_CAPACITY as usize {
-        let make = || (0..AT_ONCE).map(|_| bind()).collect::<io::Result<Vec<_>>>();
+        let make = || {
+            (0..BURST_LEN)
+                .map(|_| bind())
+                .collect::<io::Result<Vec<_>>>()
+        };
         let others = observed.make(&host, make)??;
         for other in &others {
             arrives(&mut observed, 1, other)?;

@@ -181,7 +181,7 @@ fn a_socket_has_a_process_name_an_inode_and_a_drop_count() {
 #[test]
 fn a_socket_of_a_container_has_the_process_ids_of_both_pid_namespaces() {
     let observed = Observed::new();
-    let host = Namespace::alone().unwrap();
+    let host = Namespace::isolated().unwrap();
     let bind = || UdpSocket::bind("127.0.0.1:0").unwrap();
     let socket = netns::within(&host.network(), bind).unwrap();
     let cookie = cookie(&socket);

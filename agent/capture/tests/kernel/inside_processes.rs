@@ -13,7 +13,7 @@ use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 use std::time::{Duration, Instant};
 
 use ros2probe_attach::client::Broker;
-use ros2probe_capture::breakpoints::Means;
+use ros2probe_capture::breakpoints::AttachMethod;
 use ros2probe_capture::filter::Deliveries;
 use ros2probe_capture::inside::programs::{self, Attached, Events, Programs, Tables};
 use ros2probe_capture::inside::table::{MAX_PROCESS_HITS, ProcessTable, Round};
@@ -46,10 +46,15 @@ struct Process {
 impl Robot {
     /// Builds the program with compiler options `defines`, such as `-DHUMBLE`.
     fn new(place: u32, defines: &[&str], has_callbacks: bool) -> Self {
-        Self::by(Means::of_this_kernel(), place, defines, has_callbacks)
+        Self::by(
+            AttachMethod::of_this_kernel(),
+            place,
+            defines,
+            has_callbacks,
+        )
     }
 
-    fn by(means: Means, place: u32, defines: &[&str], has_callbacks: bool) -> Self {
+    fn by(means: AttachMethod, place: u32, defines: &[&str], has_callbacks: bool) -> Self {
         let program = TracedProgram::build(place, defines).unwrap();
         let (programs, mut tables) = programs::load(has_callbacks, None, means)
             .expect("loading the kernel programs needs root: run the tests with sudo");
@@ -157,8 +162,8 @@ impl Drop for Process {
 }
 
 /// Returns the means of this kernel, and the means that every kernel has; they may be the same.
-fn means() -> [Means; 2] {
-    [Means::of_this_kernel(), Means::PerfEvents]
+fn attach_methods() -> [AttachMethod; 2] {
+    [AttachMethod::of_this_kernel(), AttachMethod::PerfEvents]
 }
 
 fn milliseconds(duration: Duration) -> f64 {
@@ -167,7 +172,7 @@ fn milliseconds(duration: Duration) -> f64 {
 
 #[test]
 fn messages_of_a_process_older_than_the_probes_are_counted_and_named() {
-    for (place, means) in [240, 248].into_iter().zip(means()) {
+    for (place, means) in [240, 248].into_iter().zip(attach_methods()) {
         let mut robot = Robot::by(means, place, &[], false);
         let mut process = robot.start();
         // The programs are attached while the process runs, so it has announced nothing.
@@ -360,7 +365,7 @@ fn the_period_and_the_wait_of_a_timer_are_read_by_either_steady_clock() {
 }
 
 #[test]
-fn messages_taken_without_rmw_take_count_for_their_subscription_and_not_as_timers() {
+fn messages_taken_without_rmw_take_count_as_subscription_calls() {
     for is_older in [true, false] {
         let mut robot = Robot::new(248, &[], true);
         if !is_older {
@@ -421,7 +426,7 @@ fn a_killed_process_leaves_its_last_figures_and_no_entry() {
 
 #[test]
 fn no_breakpoint_remains_after_the_probes_are_removed() {
-    for means in means() {
+    for means in attach_methods() {
         let mut robot = Robot::by(means, 248, &[], true);
         robot.attach();
         let mut process = robot.start();

@@ -8,7 +8,7 @@ use std::path::Path;
 use anyhow::{Context as _, Result, ensure};
 use aya::maps::MapInfo;
 use aya::programs::loaded_programs;
-use ros2probe_capture::breakpoints::Means;
+use ros2probe_capture::breakpoints::AttachMethod;
 use ros2probe_capture::filter::{Filter, FilterSettings};
 use ros2probe_capture::inside::programs;
 use ros2probe_testing::harness;
@@ -24,11 +24,11 @@ const LISTINGS: usize = 20;
 #[test]
 fn tables_of_tracepoints_and_uprobes_are_allocated_beforehand() -> Result<()> {
     harness::require()?;
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let mut filter = Filter::load_host(&FilterSettings::default())?;
     filter.attach(&File::open(host.cgroup())?)?;
     filter.attach_tracepoints(false);
-    let means = Means::of_this_kernel();
+    let means = AttachMethod::of_this_kernel();
     let _uprobe = Filter::load_uprobe(&FilterSettings::default(), None, means)?;
     let _inside = programs::load(true, None, means)?;
     let kinds = ["socket_full", "shm_handed", "rcl_publish", "callback_start"];

@@ -16,7 +16,7 @@ use ros2probe_capture::netns;
 use ros2probe_capture::pcap::PcapReader;
 use ros2probe_capture::reassembly::Limits;
 use ros2probe_capture::sockets::Sockets;
-use ros2probe_capture::streams::{Before, Chunk, Protocol, Streamed, Streams, flow};
+use ros2probe_capture::streams::{Chunk, MissingBefore, Protocol, Streamed, Streams, flow};
 use ros2probe_capture::system::Clocks;
 use ros2probe_capture::wire_tap::{WireTap, WireTapSettings};
 use ros2probe_model::facts::route::Destination;
@@ -88,7 +88,7 @@ impl Observed {
             filter.set_unknown_budget(Budget::CaptureBytes, bytes)?;
         }
         filter.attach(&File::open(cgroup.path())?)?;
-        let host = Namespace::alone()?;
+        let host = Namespace::isolated()?;
         Ok(Self {
             cgroup,
             filter,
@@ -141,7 +141,7 @@ impl Observed {
         for (piece, bytes) in self.chunks() {
             let chunk = Chunk::of_piece(&piece, &bytes, Timestamp(piece.time));
             self.streams
-                .chunk(&chunk, |streamed| streamed.pass(observer));
+                .chunk(&chunk, |streamed| streamed.pass_to(observer));
         }
     }
 }

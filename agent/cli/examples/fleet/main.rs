@@ -1,6 +1,7 @@
 //! `make fleet`: three robots in network namespaces of their own, and a centre with Prometheus,
 //! Alertmanager and VictoriaMetrics. Each robot's agent delivers by remote write. The second robot
-//! loses messages between its two computers. The third one is out of reach for a minute of each two.
+//! loses messages between its two computers. The third one is out of reach for a minute of each
+//! two.
 //!
 //! The engines and the page of each robot are relayed to ports of this machine. The summary is the
 //! output of `rp fleet`.
@@ -76,7 +77,7 @@ async fn fleet(options: &Options) -> Result<()> {
         "{name} is missing: run `make fleet`, which builds it"
     );
     let directory = tempfile::tempdir().context("cannot create a directory")?;
-    let centre = Namespace::alone()?;
+    let centre = Namespace::isolated()?;
     println!("starting the centre: Prometheus, Alertmanager, VictoriaMetrics");
     let _engines = engines(&centre, directory.path())?;
     let mut relays = Vec::new();

@@ -22,7 +22,7 @@ use ros2probe_metrics::export_thread::ExportThread;
 use ros2probe_metrics::metric_sink::MetricSink;
 use ros2probe_metrics::metric_source::MetricSource;
 use ros2probe_metrics::otlp::Host;
-use ros2probe_metrics::remote_write::{self, Fate, RemoteWriteSettings, Request};
+use ros2probe_metrics::remote_write::{self, RemoteWriteSettings, Request, SampleFate};
 use ros2probe_model::report::snapshot::Snapshot;
 use ros2probe_testing::{ports, sample_robot};
 
@@ -109,7 +109,7 @@ fn run(kind: Kind, count: usize, options: &Options) -> Result<()> {
         figures.iter().map(|figures| read(figures)).sum()
     };
     let state = || {
-        let samples = sum(&|figures| figures.samples(Fate::Delivered));
+        let samples = sum(&|figures| figures.samples(SampleFate::Delivered));
         let bytes = sum(&remote_write::Figures::sent_bytes);
         Ok::<_, anyhow::Error>((samples, bytes, engine.cpu()?, Instant::now()))
     };
@@ -120,7 +120,7 @@ fn run(kind: Kind, count: usize, options: &Options) -> Result<()> {
     let samples = samples_after - samples;
     let behind = figures
         .iter()
-        .map(|figures| figures.behind())
+        .map(|figures| figures.lag_seconds())
         .fold(0.0, f64::max);
     let refused = sum(&|figures| figures.requests(Request::Refused));
     let real = |count: u64| f64::from(u32::try_from(count).unwrap_or(u32::MAX));

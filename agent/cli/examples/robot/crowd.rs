@@ -15,7 +15,7 @@ const TYPE: &str = "sensor_msgs/Imu";
 const DEPTH: usize = 10;
 
 /// Sends an Imu on each of `topics` topics, `rate` times per second, from as many nodes as needed.
-pub(crate) async fn talk(
+pub(crate) async fn send_all(
     context: &Context,
     topics: usize,
     rate: f64,
@@ -41,8 +41,12 @@ pub(crate) async fn talk(
     tokio::task::spawn_blocking(move || join([sending])).await?
 }
 
-/// Receives the messages of [`talk`].
-pub(crate) async fn hear(context: &Context, topics: usize, stop: &Arc<AtomicBool>) -> Result<()> {
+/// Receives the messages of [`send_all`].
+pub(crate) async fn receive_all(
+    context: &Context,
+    topics: usize,
+    stop: &Arc<AtomicBool>,
+) -> Result<()> {
     let qos = reliable(DEPTH);
     for first in (0..topics).step_by(TOPICS_OF_A_NODE) {
         let mut node = node(context, &format!("/listener{first}"), bare())?;

@@ -120,8 +120,8 @@ async fn main() -> Result<()> {
         Role::Monitor => monitor(&context, &stop, interrupted).await?,
         Role::Pub => publish(&context, &options, &stop, &log).await?,
         Role::Sub => subscribe(&context, &options, &stop, &log).await?,
-        Role::Talkers => crowd::talk(&context, options.topics, options.rate, &stop).await?,
-        Role::Listeners => crowd::hear(&context, options.topics, &stop).await?,
+        Role::Talkers => crowd::send_all(&context, options.topics, options.rate, &stop).await?,
+        Role::Listeners => crowd::receive_all(&context, options.topics, &stop).await?,
     }
     log.write(&json!({"ev": "exit", "t": unix_ns()}));
     Ok(())

@@ -18,7 +18,7 @@ const ENDPOINTS: u32 = 8192;
 /// Each participant has a writer for samples, one for `ros_discovery_info`, and readers.
 const READERS: u32 = ENDPOINTS / PARTICIPANTS - 2;
 /// No process listens on this port, so only the agent sees the packets.
-const NOBODY: u16 = 7399;
+const UNUSED_PORT: u16 = 7399;
 /// Number of packets between pauses: fast enough for leases of 12 s, slow enough for every ring.
 const BURST: usize = 8;
 const PAUSE: Duration = Duration::from_millis(2);
@@ -45,7 +45,7 @@ pub(crate) fn measure(program: &Path) -> Result<()> {
     std::fs::write(&configuration, text)?;
     let agent = Agent::start(&link.robot, program, &configuration)?;
     let from = format!("{}:0", link.monitor.address());
-    let to = format!("{}:{NOBODY}", link.robot.address());
+    let to = format!("{}:{UNUSED_PORT}", link.robot.address());
     let mut sender = Sender::new(&link.monitor, &from, &to)?;
     let mut talkers: Vec<_> = (0..PARTICIPANTS)
         .map(|number| Talker::new(number, &topic(number)))
@@ -56,7 +56,7 @@ pub(crate) fn measure(program: &Path) -> Result<()> {
     };
     let mut send = |messages: &mut dyn Iterator<Item = Vec<u8>>| -> Result<()> {
         for (number, message) in messages.enumerate() {
-            sender.carry(&message)?;
+            sender.send(&message)?;
             if number % BURST == 0 {
                 std::thread::sleep(PAUSE);
             }

@@ -43,11 +43,11 @@ const BUSY: u64 = 16_000_000;
 pub(crate) struct Footprint {
     /// Name and size of the file, and of the binaries for other architectures, if they were built.
     sizes: Vec<(String, u64)>,
-    sources: Vec<OfSource>,
+    sources: Vec<SourceFootprint>,
 }
 
 /// Figures with one source.
-struct OfSource {
+struct SourceFootprint {
     name: &'static str,
     /// Medians of the startup times.
     start: Start,
@@ -67,11 +67,11 @@ struct Start {
 }
 
 /// A process that is killed when its value is dropped.
-struct Killed(Child);
+struct KillOnDrop(Child);
 
 impl Footprint {
     pub(crate) fn measure(program: &Path, length: Duration) -> Result<Footprint> {
-        let sources = ["host", "wire"].map(|name| OfSource::measure(name, program, length));
+        let sources = ["host", "wire"].map(|name| SourceFootprint::measure(name, program, length));
         Ok(Footprint {
             sizes: sizes(program)?,
             sources: sources.into_iter().collect::<Result<_>>()?,
@@ -103,8 +103,8 @@ impl Footprint {
     }
 }
 
-impl OfSource {
-    fn measure(name: &'static str, program: &Path, length: Duration) -> Result<OfSource> {
+impl SourceFootprint {
+    fn measure(name: &'static str, program: &Path, length: Duration) -> Result<SourceFootprint> {
         let link = Link::new()?;
         let directory = tempfile::tempdir().context("cannot create a directory")?;
         let configuration = directory.path().join("ros2probe.yaml");
@@ -117,7 +117,7 @@ impl OfSource {
         let _crowd = crowd(&link)?;
         wait_for_topics(&agent)?;
         let busy = most_during(length, &agent, true)?;
-        Ok(OfSource {
+        Ok(SourceFootprint {
             name,
             start,
             idle,
@@ -163,7 +163,7 @@ impl Start {
         command.args(["--pdeathsig", "KILL"]).arg(program);
         command.args(["run", "--config"]).arg(configuration);
         let agent = command.env("NOTIFY_SOCKET", notify).spawn();
-        let mut agent = Killed(agent.context("cannot start the agent")?);
+        let mut agent = KillOnDrop(agent.context("cannot start the agent")?);
         let (mut ready, mut scrape) = (None, None);
         loop {
             if let (Some(ready), Some(scrape)) = (ready, scrape) {
@@ -260,7 +260,7 @@ impl fmt::Display for Footprint {
     }
 }
 
-impl Drop for Killed {
+impl Drop for KillOnDrop {
     fn drop(&mut self) {
         let _ = self.0.kill();
         let _ = self.0.wait();

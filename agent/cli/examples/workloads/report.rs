@@ -23,15 +23,15 @@ pub(crate) struct Row {
 /// Limits for the agent's cost.
 pub(crate) struct Targets {
     /// Maximum CPU time, as a fraction of the subscriber's.
-    of_subscriber: f64,
+    max_subscriber_ratio: f64,
     /// Maximum CPU time, as a fraction of the reference implementation's.
-    of_reference: f64,
+    max_reference_ratio: f64,
     /// Maximum number of bytes that cannot be reclaimed.
     unreclaimable: u64,
     /// Maximum fraction of the traffic that is copied, for large samples.
     copied: f64,
     /// Maximum fraction of a core for the agent with the host hook.
-    of_core: f64,
+    max_core_share: f64,
     /// Maximum CPU time of all processes with the host hook, as a fraction of that without it, for
     /// large samples.
     of_workload: f64,
@@ -59,11 +59,11 @@ impl Miss {
 impl Default for Targets {
     fn default() -> Self {
         Targets {
-            of_subscriber: 0.1,
-            of_reference: 0.05,
+            max_subscriber_ratio: 0.1,
+            max_reference_ratio: 0.05,
             unreclaimable: 16_000_000,
             copied: 0.01,
-            of_core: 0.001,
+            max_core_share: 0.001,
             of_workload: 1.02,
         }
     }
@@ -91,25 +91,25 @@ impl Row {
                 fails,
             });
         };
-        for (who, name) in AGENTS {
-            let agent = self.cpu(who);
-            for (whose, theirs, target) in [
+        for (observer_kind, name) in AGENTS {
+            let agent = self.cpu(observer_kind);
+            for (reference_name, reference_cpu, target) in [
                 (
                     "subscriber's",
                     Some(self.cpu(Observer::Subscriber)),
-                    targets.of_subscriber,
+                    targets.max_subscriber_ratio,
                 ),
-                ("reference's", self.reference, targets.of_reference),
+                ("reference's", self.reference, targets.max_reference_ratio),
             ] {
-                let share = theirs.map_or(0.0, |theirs| agent / theirs);
+                let share = reference_cpu.map_or(0.0, |reference_cpu| agent / reference_cpu);
                 if share > target {
                     miss(
                         false,
-                        format!("{name} CPU is {share:.3} of the {whose}, aim {target}"),
+                        format!("{name} CPU is {share:.3} of the {reference_name}, aim {target}"),
                     );
                 }
             }
-            if self.memory(who).unreclaimable > targets.unreclaimable {
+            if self.memory(observer_kind).unreclaimable > targets.unreclaimable {
                 miss(
                     true,
                     format!(
@@ -120,17 +120,17 @@ impl Row {
             }
         }
         let share = self.cpu(Observer::Host) / UNIT_SECONDS;
-        if share > targets.of_core {
+        if share > targets.max_core_share {
             miss(
                 false,
                 format!(
                     "host CPU is {:.3} % of a core, aim {} %",
                     share * 100.0,
-                    targets.of_core * 100.0
+                    targets.max_core_share * 100.0
                 ),
             );
         }
-        let more = self.beside_nobody(Observer::Host);
+        let more = self.without_observer(Observer::Host);
         if self.is_large() && more > targets.of_workload {
             miss(
                 false,
@@ -181,8 +181,8 @@ impl Row {
 
     /// Returns the CPU time of all processes, as a fraction of that without an observer. It
     /// includes the observer's work in the kernel on behalf of other processes.
-    fn beside_nobody(&self, observer: Observer) -> f64 {
-        let median = |who| median(self.of(who).map(|window| window.workload));
+    fn without_observer(&self, observer: Observer) -> f64 {
+        let median = |observer_kind| median(self.of(observer_kind).map(|window| window.workload));
         median(observer) / median(Observer::None)
     }
 
@@ -192,7 +192,7 @@ impl Row {
 
     /// Returns the median for each observer.
     fn each(&self, value: impl Fn(&Window) -> f64) -> String {
-        let medians = Observer::ALL.map(|who| median(self.of(who).map(&value)));
+        let medians = Observer::ALL.map(|observer_kind| median(self.of(observer_kind).map(&value)));
         medians.map(|median| format!("{median:.2}")).join(", ")
     }
 
@@ -214,9 +214,10 @@ impl fmt::Display for Row {
         let (host, wire) = (self.cpu(Observer::Host), self.cpu(Observer::Wire));
         let subscriber = self.cpu(Observer::Subscriber);
         let megabytes = |observer| self.memory(observer).megabytes();
-        let of_reference = self
-            .reference
-            .map_or_else(|| "-".to_owned(), |theirs| format!("{:.3}", host / theirs));
+        let of_reference = self.reference.map_or_else(
+            || "-".to_owned(),
+            |reference_cpu| format!("{:.3}", host / reference_cpu),
+        );
         let counted: f64 = self
             .agent_totals()
             .map(|(_, agent_totals)| agent_totals.counted)
@@ -233,7 +234,7 @@ impl fmt::Display for Row {
             megabytes(Observer::Wire),
             megabytes(Observer::Subscriber),
             self.each(|window| window.workload),
-            self.beside_nobody(Observer::Host),
+            self.without_observer(Observer::Host),
             self.each(|window| window.machine),
             self.copied(Observer::Host),
             self.copied(Observer::Wire),

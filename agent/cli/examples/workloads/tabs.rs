@@ -23,7 +23,7 @@ const COUNTS: [usize; 3] = [0, 1, 10];
 /// Time between opening the streams and the measurement, so that the whole state has been sent.
 const SETTLED: Duration = Duration::from_secs(5);
 /// Maximum fraction of a core that one page may use.
-const OF_CORE: f64 = 0.01;
+const MAX_CORE_SHARE: f64 = 0.01;
 
 /// Figures of the agent with this number of streams.
 struct Open {
@@ -69,7 +69,7 @@ pub(crate) fn measure(program: &Path, length: Duration) -> Result<Vec<Miss>> {
         all.next().map_or(0.0, |open| open.of_core)
     };
     let one = of(1) - of(0);
-    Ok(Vec::from_iter((one >= OF_CORE).then(|| {
+    Ok(Vec::from_iter((one >= MAX_CORE_SHARE).then(|| {
         Miss::noted(format!("one page takes {:.2} % of a core", one * 1e2))
     })))
 }

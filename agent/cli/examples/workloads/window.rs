@@ -125,7 +125,7 @@ impl Window {
             peer.wait_matched()?;
         }
         for publisher in &mut publishers {
-            publisher.go()?;
+            publisher.start_sending()?;
         }
         std::thread::sleep(WARM_UP);
 

@@ -8,16 +8,16 @@ use anyhow::{Result, bail};
 use ros2probe::discover::zenoh::address::RouterAddress;
 use ros2probe::discover::zenoh::graph::{DomainGraph, EndpointKind};
 use ros2probe::discover::zenoh::session::Step;
-use ros2probe::discover::zenoh::{Answer, connect, converse, plan};
+use ros2probe::discover::zenoh::{Answer, connect, plan, run_conversation};
 use ros2probe_daemon::agent::configuration;
-use ros2probe_daemon::privilege::{Role, give_up};
+use ros2probe_daemon::privilege::{Role, drop_capabilities};
 
 use crate::cli::Discover;
 
 /// Mount point of the control groups of version 2.
 const CGROUP_ROOT: &str = "/sys/fs/cgroup";
 /// Kinds of endpoints in the order of the report: one, several.
-const KINDS: [(EndpointKind, &str, &str); 4] = [
+const ENDPOINT_KINDS: [(EndpointKind, &str, &str); 4] = [
     (EndpointKind::Publisher, "publisher", "publishers"),
     (EndpointKind::Subscription, "subscription", "subscriptions"),
     (EndpointKind::Server, "service", "services"),
@@ -26,9 +26,9 @@ const KINDS: [(EndpointKind, &str, &str); 4] = [
 
 /// Requests the graph from the router at this address.
 pub(super) fn discover(address: &RouterAddress, options: &Discover) -> Result<()> {
-    let unseen = unseen();
+    let unseen = unobserved_reason();
     // A connection needs no capability.
-    give_up(Role::Export)?;
+    drop_capabilities(Role::Export)?;
     let mut out = stdout().lock();
     let will = if options.dry_run { "would" } else { "will" };
     writeln!(
@@ -48,20 +48,20 @@ pub(super) fn discover(address: &RouterAddress, options: &Discover) -> Result<()
     // The plan is printed before anything is sent.
     out.flush()?;
     let (stream, peer) = connect(address)?;
-    let answer = converse(stream, peer, options.domain)?;
+    let answer = run_conversation(stream, peer, options.domain)?;
     report(&answer, &mut out)
 }
 
 /// Returns why an agent with the configuration of this host does not see the answer. `None` if it
 /// does, or if the configuration cannot be read.
-fn unseen() -> Option<String> {
+fn unobserved_reason() -> Option<String> {
     let (config, _) = configuration(None).ok()?;
     let own = std::fs::read_to_string("/proc/self/cgroup").ok()?;
-    outside(config.capture.cgroup.as_deref()?, &own)
+    outside_cgroup_note(config.capture.cgroup.as_deref()?, &own)
 }
 
 /// Returns the note if `own`, the text of `/proc/self/cgroup`, names no group within `observed`.
-fn outside(observed: &Path, own: &str) -> Option<String> {
+fn outside_cgroup_note(observed: &Path, own: &str) -> Option<String> {
     let own = own.lines().find_map(|line| line.strip_prefix("0::/"))?;
     let root = Path::new(CGROUP_ROOT);
     if root.join(own).starts_with(observed) {
@@ -86,11 +86,11 @@ fn report(answer: &Answer, out: &mut impl Write) -> Result<()> {
     }
     let graphs = session.graphs();
     for (domain, graph) in &graphs {
-        writeln!(out, "  domain {}: learned {}", domain.0, counts(graph))?;
+        writeln!(out, "  domain {}: learned {}", domain.0, counts_text(graph))?;
         for node in &graph.nodes {
             writeln!(out, "    node   {node}")?;
         }
-        for (kind, one, _) in KINDS {
+        for (kind, one, _) in ENDPOINT_KINDS {
             for (name, ros_type) in graph.endpoints.get(&kind).into_iter().flatten() {
                 writeln!(out, "    {one} {name} {ros_type}")?;
             }
@@ -123,9 +123,10 @@ fn report(answer: &Answer, out: &mut impl Write) -> Result<()> {
     Ok(())
 }
 
-fn counts(graph: &DomainGraph) -> String {
+fn counts_text(graph: &DomainGraph) -> String {
     let nodes = number(graph.nodes.len(), "node", "nodes");
-    let endpoints = KINDS.map(|(kind, one, several)| number(graph.count(kind), one, several));
+    let endpoints =
+        ENDPOINT_KINDS.map(|(kind, one, several)| number(graph.count(kind), one, several));
     let (others, last) = endpoints.split_at(endpoints.len() - 1);
     format!("{nodes}, {} and {}", others.join(", "), last.concat())
 }
@@ -148,9 +149,10 @@ mod tests {
             "0::/robot.slice\n",
             "1:name=x:/\n0::/robot.slice/nav.service\n",
         ] {
-            assert_eq!(outside(observed, inside), None, "{inside}");
+            assert_eq!(outside_cgroup_note(observed, inside), None, "{inside}");
         }
-        let note = outside(observed, "0::/user.slice/user-0.slice/session-1.scope\n").unwrap();
+        let note =
+            outside_cgroup_note(observed, "0::/user.slice/user-0.slice/session-1.scope\n").unwrap();
         assert!(
             note.contains("/sys/fs/cgroup/robot.slice (capture.cgroup)"),
             "{note}"
@@ -162,9 +164,9 @@ mod tests {
         let remedy = "`sudo systemd-run --slice=robot.slice --pipe --wait rp discover --router`";
         assert!(note.ends_with(remedy), "{note}");
         // A group whose name has the same prefix is another group.
-        assert!(outside(observed, "0::/robot.slice2\n").is_some());
+        assert!(outside_cgroup_note(observed, "0::/robot.slice2\n").is_some());
         let container = Path::new("/sys/fs/cgroup/docker/0123");
-        let note = outside(container, "0::/\n").unwrap();
+        let note = outside_cgroup_note(container, "0::/\n").unwrap();
         assert!(
             note.ends_with("start this command in that control group"),
             "{note}"

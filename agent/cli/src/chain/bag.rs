@@ -16,9 +16,9 @@ use ros2probe_model::facts::names::TopicName;
 use ros2probe_wire::{Expansion, Timestamp};
 
 /// Interval of progress reports, in messages.
-const PROGRESS: u64 = 65_536;
+const PROGRESS_INTERVAL: u64 = 65_536;
 /// Type of messages that describe the images of another topic and have the same stamps.
-const COMPANION: &str = "sensor_msgs/msg/CameraInfo";
+const COMPANION_TYPE: &str = "sensor_msgs/msg/CameraInfo";
 
 /// Chains in a bag.
 #[derive(Debug)]
@@ -59,7 +59,7 @@ impl BagChains {
         let mut seen = 0_u64;
         let read = messages::read(path, expansion, &mut |message, total| {
             seen += 1;
-            if seen.is_multiple_of(PROGRESS) {
+            if seen.is_multiple_of(PROGRESS_INTERVAL) {
                 progress(seen, total);
             }
             let logged = Timestamp(message.log_time);
@@ -91,7 +91,7 @@ impl BagChains {
     /// known.
     #[must_use]
     pub fn chains(&self, from: Option<&str>, to: Option<&str>) -> Vec<Chain<'_>> {
-        let lead = |end| self.lead(end);
+        let lead = |end| self.representative(end);
         parts(self.facts.chains.iter(), from.map(lead), to.map(lead))
     }
 
@@ -103,7 +103,7 @@ impl BagChains {
 
     /// Returns topics that stand for others in the chains, because they are published together.
     #[must_use]
-    pub fn together(&self) -> Vec<SharedStamps> {
+    pub fn simultaneous_topics(&self) -> Vec<SharedStamps> {
         let mut all: Vec<SharedStamps> = Vec::new();
         for (topic, lead) in &self.facts.together {
             let known = all.iter_mut().find(|known| *known.topic == **lead);
@@ -135,7 +135,7 @@ impl BagChains {
 
     /// Returns the number of messages that were not used: their stamps are multiples of 100 µs.
     #[must_use]
-    pub const fn rounded(&self) -> u64 {
+    pub const fn rounded_messages(&self) -> u64 {
         self.facts.rounded
     }
 
@@ -146,7 +146,7 @@ impl BagChains {
     }
 
     /// Returns the topic that stands for this one in the chains.
-    fn lead<'a>(&'a self, name: &'a str) -> &'a str {
+    fn representative<'a>(&'a self, name: &'a str) -> &'a str {
         let mut together = self.facts.together.iter();
         let known = together.find(|(topic, _)| **topic == *name);
         known.map_or(name, |(_, lead)| lead)
@@ -155,7 +155,7 @@ impl BagChains {
 
 /// Returns whether messages of this topic begin with a header and may belong to a chain.
 fn is_stamped(message: &Message<'_>) -> bool {
-    if message.type_name == COMPANION {
+    if message.type_name == COMPANION_TYPE {
         return false;
     }
     // The text of the type itself comes first. The types of its fields follow a line of `=`.
@@ -217,7 +217,7 @@ mod tests {
     }
 
     #[test]
-    fn messages_that_begin_with_a_header_are_stamped_whatever_their_type() {
+    fn messages_of_any_type_that_begin_with_a_header_are_stamped() {
         let message = |type_name, definition| Message {
             topic: "/a",
             type_name,

@@ -13,14 +13,14 @@ use crate::top::text;
 /// Maximum number of topics in the drawn graph.
 const MAX_DRAWN: usize = 60;
 /// Topics of every node, which the drawing leaves out as rqt_graph does.
-const COMMON: [&str; 2] = ["/rosout", "/parameter_events"];
+const COMMON_TOPICS: [&str; 2] = ["/rosout", "/parameter_events"];
 /// Maximum number of characters of a name in the drawing.
 const NAME_CHARACTERS: usize = 34;
 const CHART_WIDTH: f64 = 160.0;
 const CHART_HEIGHT: f64 = 28.0;
-const ROW: f64 = 22.0;
-const COLUMN: f64 = 260.0;
-const GAP: f64 = 70.0;
+const ROW_HEIGHT: f64 = 22.0;
+const COLUMN_WIDTH: f64 = 260.0;
+const COLUMN_GAP: f64 = 70.0;
 
 /// Draws the rate of a topic over a run of `seconds`. Lines mark the judged part.
 pub(super) fn chart(series: &Series, seconds: f64, judged: (f64, f64)) -> String {
@@ -64,7 +64,7 @@ pub(super) fn graph(seen: &Observation, marked: &BTreeSet<&str>) -> (String, usi
     let mut topics: Vec<&str> = seen
         .topics
         .iter()
-        .filter(|(name, topic)| !topic.is_hidden && !COMMON.contains(&&***name))
+        .filter(|(name, topic)| !topic.is_hidden && !COMMON_TOPICS.contains(&&***name))
         .map(|(name, _)| &**name)
         .collect();
     topics.sort_by_key(|name| !marked.contains(name));
@@ -84,16 +84,16 @@ pub(super) fn graph(seen: &Observation, marked: &BTreeSet<&str>) -> (String, usi
     };
     let columns = [nodes(true), topics, nodes(false)];
     let rows = columns.iter().map(Vec::len).max().unwrap_or_default();
-    let height = to_f64(rows) * ROW;
-    let width = 3.0 * COLUMN + 2.0 * GAP;
+    let height = to_f64(rows) * ROW_HEIGHT;
+    let width = 3.0 * COLUMN_WIDTH + 2.0 * COLUMN_GAP;
     let mut boxes = String::new();
     let mut places = [BTreeMap::new(), BTreeMap::new(), BTreeMap::new()];
     for (column, (names, places)) in columns.iter().zip(&mut places).enumerate() {
-        let x = to_f64(column) * (COLUMN + GAP);
-        let top = (height - to_f64(names.len()) * ROW) / 2.0;
+        let x = to_f64(column) * (COLUMN_WIDTH + COLUMN_GAP);
+        let top = (height - to_f64(names.len()) * ROW_HEIGHT) / 2.0;
         for (row, name) in names.iter().enumerate() {
-            let y = top + to_f64(row) * ROW;
-            places.insert(*name, y + ROW / 2.0);
+            let y = top + to_f64(row) * ROW_HEIGHT;
+            places.insert(*name, y + ROW_HEIGHT / 2.0);
             let round = if column == 1 { 2 } else { 9 };
             let class = if column == 1 && marked.contains(name) {
                 "bad"
@@ -102,14 +102,14 @@ pub(super) fn graph(seen: &Observation, marked: &BTreeSet<&str>) -> (String, usi
             };
             let _ = write!(
                 boxes,
-                "<g class=\"{class}\"><title>{0}</title><rect x=\"{x}\" y=\"{1}\" width=\"{COLUMN}\" \
+                "<g class=\"{class}\"><title>{0}</title><rect x=\"{x}\" y=\"{1}\" width=\"{COLUMN_WIDTH}\" \
                  height=\"{2}\" rx=\"{round}\" fill=\"none\" stroke=\"currentColor\"/><text x=\"{3}\" \
                  y=\"{4}\" font-size=\"11\" fill=\"currentColor\">{5}</text></g>",
                 escape(*name),
                 y + 2.0,
-                ROW - 4.0,
+                ROW_HEIGHT - 4.0,
                 x + 8.0,
-                y + ROW / 2.0 + 4.0,
+                y + ROW_HEIGHT / 2.0 + 4.0,
                 escape(&*text::end(name, NAME_CHARACTERS, '…'))
             );
         }
@@ -119,11 +119,14 @@ pub(super) fn graph(seen: &Observation, marked: &BTreeSet<&str>) -> (String, usi
     for edge in edges {
         let topic = topics.get(&*edge.topic);
         let (ends, from) = match edge.is_publisher {
-            true => (publishers.get(&*edge.node).zip(topic), COLUMN),
-            false => (topic.zip(subscribers.get(&*edge.node)), 2.0 * COLUMN + GAP),
+            true => (publishers.get(&*edge.node).zip(topic), COLUMN_WIDTH),
+            false => (
+                topic.zip(subscribers.get(&*edge.node)),
+                2.0 * COLUMN_WIDTH + COLUMN_GAP,
+            ),
         };
         let Some((begin, end)) = ends else { continue };
-        let (middle, to) = (from + GAP / 2.0, from + GAP);
+        let (middle, to) = (from + COLUMN_GAP / 2.0, from + COLUMN_GAP);
         let _ = write!(
             lines,
             "<path d=\"M{from} {begin}C{middle} {begin} {middle} {end} {to} {end}\"/>"

@@ -310,14 +310,14 @@ impl Judgement<'_> {
             let lines = failing.iter().map(|it| sentence(it, ""));
             let tolerated = tolerated
                 .iter()
-                .map(|it| sentence(it, self.why_tolerated(it)));
+                .map(|it| sentence(it, self.tolerance_reason(it)));
             let lines: Vec<_> = lines.chain(tolerated).collect();
             self.condition(Group::Findings, kind, verdict, lines.join("\n"))
         };
         kinds.into_iter().map(of_kind).collect()
     }
 
-    fn why_tolerated(&self, found: &Finding) -> &'static str {
+    fn tolerance_reason(&self, found: &Finding) -> &'static str {
         match self.rules.fail_on.covers(found.severity) {
             true => " (only at the start or the shutdown)",
             false => " (below --fail-on)",
@@ -414,7 +414,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_that_nothing_observed_fails() {
+    fn an_unobserved_run_fails() {
         let empty = Observation::new(RULES, 0);
         let conditions = judge(&run(20.0), &empty);
         assert_eq!(failed(&conditions), [("observation", "participants")]);
@@ -509,7 +509,7 @@ mod tests {
     }
 
     #[test]
-    fn only_findings_of_the_judged_time_and_severity_fail() {
+    fn only_findings_of_the_evaluated_time_and_severity_fail() {
         let finding = |id: &str, severity| live::Finding {
             id: id.to_owned(),
             kind: id.to_owned().into(),

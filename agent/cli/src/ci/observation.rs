@@ -12,7 +12,7 @@ use ros2probe_daemon::escape::visible;
 
 use super::Rules;
 use super::series::{Point, Series};
-use super::tally::{LATE, Tally};
+use super::tally::{MAX_STATE_DELAY, Tally};
 
 /// Maximum number of topics over a run.
 const MAX_TOPICS: usize = 2048;
@@ -24,10 +24,10 @@ const MAX_EDGES: usize = 8192;
 const MAX_EXPECTED: usize = 2048;
 
 /// Kinds of findings about messages that the agent does not see.
-const UNSEEN: [&str; 3] = ["observation_suspended", "unknown_writers", "zenoh_unseen"];
+const UNSEEN_FINDINGS: [&str; 3] = ["observation_suspended", "unknown_writers", "zenoh_unseen"];
 
 /// Kinds of findings that other conditions judge.
-const JUDGED_ELSEWHERE: [&str; 3] = ["loss", "watch_violated", "watch_silent"];
+const EXPECTATION_FINDINGS: [&str; 3] = ["loss", "watch_violated", "watch_silent"];
 
 /// What an agent observed while a command ran. Times are seconds from the start of the command.
 #[derive(Debug)]
@@ -51,7 +51,7 @@ pub struct Observation {
     /// Times that the agent refused or evicted an entry since its start, by the key of the limit.
     pub reached: BTreeMap<&'static str, u64>,
     /// Topics, findings, pairs of a node and a topic, or of a watch and a topic, beyond the caps.
-    pub left_out: u64,
+    pub omitted: u64,
     /// The latest state of the stream.
     present: Present,
     /// Times at which participants left.
@@ -140,7 +140,7 @@ impl Observation {
             participants: 0,
             dropped: 0,
             reached: BTreeMap::new(),
-            left_out: 0,
+            omitted: 0,
             present: Present::default(),
             departures: Vec::new(),
         }
@@ -156,12 +156,12 @@ impl Observation {
     pub fn line(&mut self, line: Line<'_>, now: f64) -> bool {
         match line {
             Line::Graph(graph) => self.graph(&graph, now),
-            Line::Findings(findings) => self.found(findings),
+            Line::Findings(findings) => self.set_findings(findings),
             Line::Values(values) => {
                 for row in values.topics {
                     self.present.rows.insert(row.0, row);
                 }
-                self.second(now);
+                self.count_second(now);
                 return true;
             }
             Line::Open(_) | Line::Agent(_) | Line::History(_) | Line::Events(_) | Line::End(_) => {}
@@ -173,7 +173,7 @@ impl Observation {
     pub fn health(&mut self, health: &Health) {
         self.dropped = health.dropped();
         for limit in &health.limits {
-            let known = Limit::find(&limit.limit).filter(|known| known.blinds());
+            let known = Limit::find(&limit.limit).filter(|known| known.hides_data());
             if let Some(known) = known.filter(|_| limit.reached > 0) {
                 self.reached.insert(known.key(), limit.reached);
             }
@@ -197,14 +197,13 @@ impl Observation {
                  in --expect"
             ));
         }
-        if self.left_out > 0 {
-            let left_out = self.left_out;
+        if self.omitted > 0 {
+            let left_out = self.omitted;
             missed.push(format!("{left_out} names are left out: the report is full"));
         }
-        let unseen = self
-            .findings
-            .values()
-            .filter(|found| UNSEEN.contains(&&*found.kind) && found.seconds.judged(until) > 0);
+        let unseen = self.findings.values().filter(|found| {
+            UNSEEN_FINDINGS.contains(&&*found.kind) && found.seconds.judged(until) > 0
+        });
         missed.extend(unseen.map(|found| found.text.clone()));
         missed
     }
@@ -227,7 +226,7 @@ impl Observation {
             for topic in topics {
                 let name = visible(&topic.topic).into_owned();
                 if let Some(expected) = self.expect((pattern.clone(), name), &watch.expectations) {
-                    expected.take(topic, now, &rules);
+                    expected.add_state(topic, now, &rules);
                 }
             }
         }
@@ -251,13 +250,13 @@ impl Observation {
         let earliest = end - self.rules.shutdown;
         let mut departures = self.departures.iter();
         let first = departures.find(|time| **time >= earliest);
-        first.map_or(end, |first| first - LATE)
+        first.map_or(end, |first| first - MAX_STATE_DELAY)
     }
 
     /// Returns the findings that other conditions do not judge.
     pub fn own_findings(&self) -> impl Iterator<Item = &Finding> {
         let all = self.findings.values();
-        all.filter(|found| !JUDGED_ELSEWHERE.contains(&&*found.kind))
+        all.filter(|found| !EXPECTATION_FINDINGS.contains(&&*found.kind))
     }
 
     fn expect(
@@ -266,7 +265,7 @@ impl Observation {
         expectations: &Expectations,
     ) -> Option<&mut Expected> {
         if !self.expected.contains_key(&key) && self.expected.len() == MAX_EXPECTED {
-            self.left_out += 1;
+            self.omitted += 1;
             return None;
         }
         // A glob without a topic has a row of its own.
@@ -285,39 +284,42 @@ impl Observation {
         let remain = |id: &u32| participants.contains(id);
         if !self.present.participants.iter().all(remain) {
             self.departures.push(now);
-            let certain = now - self.rules.shutdown - 2.0 * LATE;
+            let certain = now - self.rules.shutdown - 2.0 * MAX_STATE_DELAY;
             self.departures.retain(|time| *time >= certain);
         }
         self.participants = self.participants.max(participants.len());
         self.present.participants = participants;
         let topics = graph.topics.iter().filter(|topic| here(topic.1));
-        let names = topics.clone().map(|topic| (topic.0, shown(&topic.2)));
+        let names = topics
+            .clone()
+            .map(|topic| (topic.0, display_name(&topic.2)));
         self.present.topics = names.collect();
         self.present
             .rows
             .retain(|id, _| self.present.topics.contains_key(id));
         for topic in topics {
-            let types = topic.5.iter().map(|each| shown(each)).collect();
-            let name = shown(&topic.2);
+            let types = topic.5.iter().map(|each| display_name(each)).collect();
+            let name = display_name(&topic.2);
             if let Some(known) = self.topics.get_mut(&name) {
                 known.types = types;
             } else if self.topics.len() == MAX_TOPICS {
-                self.left_out += 1;
+                self.omitted += 1;
             } else {
                 let topic = Topic::new(types, topic.6 != 0, now);
                 self.topics.insert(name, topic);
             }
         }
-        self.connect(graph);
+        self.set_edges(graph);
     }
 
-    fn connect(&mut self, graph: &Graph<'_>) {
+    fn set_edges(&mut self, graph: &Graph<'_>) {
         let nodes = graph.nodes.iter().filter(|node| node.1 == self.domain_id);
-        let nodes: HashMap<u32, String> = nodes.map(|node| (node.0, shown(&node.2))).collect();
+        let nodes: HashMap<u32, String> =
+            nodes.map(|node| (node.0, display_name(&node.2))).collect();
         let processes = graph.participants.iter().map(|each| {
             let process = each.6.as_deref().unwrap_or("a process");
             let id = each.5.map_or_else(String::new, |id| format!(" {id}"));
-            (each.0, shown(&format!("{process}{id}")))
+            (each.0, display_name(&format!("{process}{id}")))
         });
         let processes: HashMap<u32, String> = processes.collect();
         let publishers = graph.publishers.iter().map(|each| (each, true));
@@ -338,14 +340,14 @@ impl Observation {
             if self.edges.len() < MAX_EDGES {
                 self.edges.insert(edge);
             } else if !self.edges.contains(&edge) {
-                self.left_out += 1;
+                self.omitted += 1;
             }
         }
         let room = MAX_EDGES.saturating_sub(self.nodes.len());
         self.nodes.extend(nodes.into_values().take(room));
     }
 
-    fn found(&mut self, findings: Vec<live::Finding>) {
+    fn set_findings(&mut self, findings: Vec<live::Finding>) {
         self.present.findings.clear();
         for finding in findings {
             let here = finding.domain_id.is_none_or(|id| id == self.domain_id);
@@ -354,15 +356,15 @@ impl Observation {
             }
             let known = self.findings.remove(&finding.id);
             if known.is_none() && self.findings.len() == MAX_FINDINGS {
-                self.left_out += 1;
+                self.omitted += 1;
                 continue;
             }
             self.present.findings.insert(finding.id.clone());
             let found = Finding {
-                kind: shown(&finding.kind),
+                kind: display_name(&finding.kind),
                 severity: finding.severity,
-                text: shown(&finding.text),
-                remedy: finding.remedy.as_deref().map(shown),
+                text: display_name(&finding.text),
+                remedy: finding.remedy.as_deref().map(display_name),
                 seconds: known.map_or_else(Tally::default, |known| known.seconds),
             };
             self.findings.insert(finding.id, found);
@@ -370,7 +372,7 @@ impl Observation {
     }
 
     /// Counts the present state for one second.
-    fn second(&mut self, now: f64) {
+    fn count_second(&mut self, now: f64) {
         for id in &self.present.findings {
             if let Some(found) = self.findings.get_mut(id) {
                 found.seconds.add(now, 1, &self.rules);
@@ -427,7 +429,7 @@ impl Topic {
 }
 
 impl Expected {
-    fn take(&mut self, topic: &WatchedTopic, now: f64, rules: &Rules) {
+    fn add_state(&mut self, topic: &WatchedTopic, now: f64, rules: &Rules) {
         let state = match &topic.state {
             Open::Known(state) => *state,
             Open::Unknown(_) => TopicState::Ok,
@@ -436,20 +438,20 @@ impl Expected {
         if state == TopicState::NotPublished {
             self.unpublished.add(now, 1, rules);
             for key in ["min_rate_hz", "max_silence_s", "publishers"] {
-                self.violate(key, now, rules);
+                self.add_violation(key, now, rules);
             }
         }
         if matches!(state, TopicState::Violated | TopicState::Silent) {
             for key in &topic.violations {
-                self.violate(key, now, rules);
+                self.add_violation(key, now, rules);
             }
         }
         if state == TopicState::Silent && !topic.violations.iter().any(|it| it == "max_silence_s") {
-            self.violate("max_silence_s", now, rules);
+            self.add_violation("max_silence_s", now, rules);
         }
     }
 
-    fn violate(&mut self, key: &str, now: f64, rules: &Rules) {
+    fn add_violation(&mut self, key: &str, now: f64, rules: &Rules) {
         if self.expectations.keys().contains(&key) {
             let tally = self.violated.entry(key.to_owned()).or_default();
             tally.add(now, 1, rules);
@@ -457,7 +459,7 @@ impl Expected {
     }
 }
 
-fn shown(name: &str) -> String {
+fn display_name(name: &str) -> String {
     visible(name).into_owned()
 }
 
@@ -533,7 +535,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn losses_of_the_start_and_of_the_shutdown_are_not_judged() {
+    fn losses_during_start_and_shutdown_are_not_evaluated() {
         let mut seen = Observation::new(RULES, 0);
         seen.line(graph(2, &["/a"]), 0.0);
         for (second, lost) in [(1_u8, 7), (6, 7), (7, 9), (20, 9)] {
@@ -588,7 +590,7 @@ pub(super) mod tests {
             let name: &'static str = format!("/t{index}").leak();
             seen.line(graph(1, &[name]), 1.0);
         }
-        assert_eq!((seen.topics.len(), seen.left_out), (MAX_TOPICS, 3));
+        assert_eq!((seen.topics.len(), seen.omitted), (MAX_TOPICS, 3));
     }
 
     #[test]
@@ -612,7 +614,7 @@ pub(super) mod tests {
             Line::Findings((0..MAX_FINDINGS + 2).map(finding).collect()),
             1.0,
         );
-        assert_eq!((seen.findings.len(), seen.left_out), (MAX_FINDINGS, 2));
+        assert_eq!((seen.findings.len(), seen.omitted), (MAX_FINDINGS, 2));
         assert_eq!(seen.findings["0"].text, "\\u{1b}[2J");
     }
 
@@ -630,7 +632,7 @@ pub(super) mod tests {
             seen.line(Line::Graph(graph), 1.0);
         }
         assert_eq!(seen.edges.len(), MAX_EDGES);
-        assert_eq!(seen.left_out, (5 * MAX_TOPICS - MAX_EDGES) as u64);
+        assert_eq!(seen.omitted, (5 * MAX_TOPICS - MAX_EDGES) as u64);
     }
 
     #[test]
@@ -653,6 +655,6 @@ pub(super) mod tests {
         };
         let watches = vec![watch];
         seen.watches(&WatchList { watches }, 1.0);
-        assert_eq!((seen.expected.len(), seen.left_out), (MAX_EXPECTED, 4));
+        assert_eq!((seen.expected.len(), seen.omitted), (MAX_EXPECTED, 4));
     }
 }

@@ -14,7 +14,7 @@ use super::observation::{Finding, Observation};
 use super::series::Means;
 use super::{Condition, Group, Run, Verdict};
 
-const HEAD: &str = "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\
+const HTML_HEAD: &str = "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\
 <meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'\">\
 <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\
 <meta name=\"color-scheme\" content=\"light dark\">";
@@ -28,7 +28,7 @@ pub fn html(run: &Run, conditions: &[Condition], seen: &Observation, bag: &str) 
     let verdict = if failed == 0 { "passed" } else { "failed" };
     let command = escape(&*run.command);
     let mut page = format!(
-        "{HEAD}<title>rp ci: {verdict}: {command}</title><style>{STYLE}</style></head><body>\n\
+        "{HTML_HEAD}<title>rp ci: {verdict}: {command}</title><style>{STYLE}</style></head><body>\n\
          <h1><span class=\"{0}\">{verdict}</span> {command}</h1>\n",
         class(failed > 0)
     );
@@ -97,11 +97,11 @@ fn summary(page: &mut String, run: &Run, conditions: &[Condition], seen: &Observ
         let _ = write!(page, "<dt>{name}</dt><dd>{}</dd>", escape(&*value));
     }
     page.push_str("</dl>\n");
-    if seen.left_out > 0 {
+    if seen.omitted > 0 {
         let _ = writeln!(
             page,
             "<p>{} names are left out: the report is full.</p>",
-            seen.left_out
+            seen.omitted
         );
     }
 }
@@ -291,7 +291,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_report_escapes_names_and_refers_to_nothing_outside() {
+    fn a_report_escapes_names_and_has_no_external_reference() {
         let mut seen = Observation::new(RULES, 0);
         seen.line(graph(1, &["/a'\"><img src=x onerror=alert(1)>", "/b"]), 0.0);
         for second in 1..=20_u8 {

@@ -6,7 +6,7 @@ use std::collections::VecDeque;
 use super::Rules;
 
 /// Seconds by which the state of the agent may be late.
-pub(super) const LATE: f64 = 1.5;
+pub(super) const MAX_STATE_DELAY: f64 = 1.5;
 
 /// A count over time.
 #[derive(Clone, Debug, Default)]
@@ -37,7 +37,7 @@ impl Tally {
         }
         self.first.get_or_insert(now);
         self.recent.push_back((now, count));
-        let certain = now - rules.shutdown - 2.0 * LATE;
+        let certain = now - rules.shutdown - 2.0 * MAX_STATE_DELAY;
         while let Some((_, count)) = self.recent.pop_front_if(|(time, _)| *time < certain) {
             self.settled += count;
         }
@@ -77,7 +77,7 @@ mod tests {
     };
 
     #[test]
-    fn entries_count_between_the_time_to_settle_and_the_end_of_the_judged_part() {
+    fn entries_between_settling_and_shutdown_are_counted() {
         let mut tally = Tally::default();
         for second in 0..40 {
             tally.add(f64::from(second), 1, &RULES);

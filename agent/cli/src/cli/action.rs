@@ -11,7 +11,7 @@ use ros2probe_api::names::Names;
 use ros2probe_api::nodes::Named;
 
 use super::events::ActionEcho;
-use super::shared::{Graph, print_found, print_or_fail, print_text};
+use super::shared::{Graph, print_names, print_or_fail, print_text};
 
 /// `rp action VERB`.
 #[derive(Args, Debug)]
@@ -80,14 +80,14 @@ struct Find {
 }
 
 impl Action {
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         match self.verb {
             None => super::help(&["action"]),
             Some(Verb::List(list)) => list.ask(),
             Some(Verb::Info(info)) => info.ask(),
             Some(Verb::Type(kind)) => kind.ask(),
             Some(Verb::Find(find)) => find.ask(),
-            Some(Verb::Echo(echo)) => echo.ask(),
+            Some(Verb::Echo(echo)) => echo.run(),
         }
     }
 }
@@ -126,7 +126,7 @@ impl Find {
             let actions: Vec<_> = action::of_topics(&names.topics).collect();
             topic::find(&self.action_type, actions.iter().map(typed), count)
         };
-        print_found(&graph, self.count_actions, found)
+        print_names(&graph, self.count_actions, found)
     }
 }
 

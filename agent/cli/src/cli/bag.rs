@@ -14,7 +14,7 @@ use ros2probe_bag::reindex::{self, Found};
 use ros2probe_daemon::escape::visible;
 
 use super::convert::Convert;
-use super::interrupt::INTERRUPTED;
+use super::interrupt::EXIT_INTERRUPTED;
 use super::record::Record;
 use super::{Arguments, Output, UserError};
 
@@ -87,15 +87,15 @@ impl Bag {
     pub(crate) const fn interrupted(&self) -> Option<u8> {
         match self.verb {
             Some(Verb::Record(_) | Verb::Convert(_)) => None,
-            _ => Some(INTERRUPTED),
+            _ => Some(EXIT_INTERRUPTED),
         }
     }
 
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         match self.verb {
             None => super::help(&["bag"]),
-            Some(Verb::Record(record)) => record.ask(),
-            Some(Verb::Convert(convert)) => convert.ask(),
+            Some(Verb::Record(record)) => record.run(),
+            Some(Verb::Convert(convert)) => convert.run(),
             Some(Verb::Info(info)) => info.ask(),
             Some(Verb::Reindex(reindex)) => reindex.ask(),
         }

@@ -21,7 +21,7 @@ use serde_json::{Value, json};
 use super::{Output, UserError};
 
 /// Interval of progress reports on a terminal.
-const PROGRESS: Duration = Duration::from_secs(1);
+const PROGRESS_INTERVAL: Duration = Duration::from_secs(1);
 
 /// `rp chain [FROM] [TO]`.
 #[derive(Args, Debug)]
@@ -51,7 +51,7 @@ pub(crate) struct Chain {
 }
 
 impl Chain {
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         if let Some(path) = self.target.replay.as_deref().filter(|path| is_bag(path)) {
             return self.of_bag(path);
         }
@@ -92,7 +92,7 @@ impl Chain {
             times,
             &ends,
             &mut |messages, total| {
-                if is_shown && last.elapsed() >= PROGRESS {
+                if is_shown && last.elapsed() >= PROGRESS_INTERVAL {
                     last = Instant::now();
                     let all = total.map(|total| format!(" of {total}"));
                     let all = all.unwrap_or_default();
@@ -152,9 +152,9 @@ fn answer(bag: &BagChains, chains: &[ros2probe_api::chains::Chain<'_>]) -> Resul
         "times": bag.times(),
         "messages": bag.messages,
         "chains": chains,
-        "published_together": shared(bag.together()),
+        "published_together": shared(bag.simultaneous_topics()),
         "unclear": shared(bag.unclear()),
-        "rounded_stamps": bag.rounded(),
+        "rounded_stamps": bag.rounded_messages(),
         "ignored_messages": bag.refused(),
         "faults": bag.faults,
     }))
@@ -163,7 +163,7 @@ fn answer(bag: &BagChains, chains: &[ros2probe_api::chains::Chain<'_>]) -> Resul
 /// Returns lines about what could not be read, and about topics that are in no chain.
 fn notes(bag: &BagChains) -> Vec<String> {
     let mut notes = bag.faults.clone();
-    for SharedStamps { topic, others } in bag.together() {
+    for SharedStamps { topic, others } in bag.simultaneous_topics() {
         let others = others.join(", ");
         notes.push(format!(
             "{topic} stands for {others}: less than 1 ms apart with one stamp"
@@ -175,10 +175,10 @@ fn notes(bag: &BagChains) -> Vec<String> {
             others.join(" and ")
         ));
     }
-    if bag.rounded() > 0 {
+    if bag.rounded_messages() > 0 {
         notes.push(format!(
             "{} messages have stamps that are multiples of 100 µs, which prove nothing in a bag",
-            bag.rounded()
+            bag.rounded_messages()
         ));
     }
     if bag.refused() > 0 {

@@ -38,11 +38,11 @@ pub(crate) use guard::CannotStart;
 /// Exit code if the command succeeded and a condition failed.
 pub(crate) const CONDITION_FAILED: u8 = 79;
 /// Maximum wait for a line before signals and the command are checked.
-const POLL: Duration = Duration::from_millis(100);
+const POLL_INTERVAL: Duration = Duration::from_millis(100);
 /// Maximum wait for the state after the end of the command.
-const LAST: Duration = Duration::from_millis(1500);
+const LAST_STATE_TIMEOUT: Duration = Duration::from_millis(1500);
 /// Interval between two lines of progress.
-const PROGRESS: Duration = Duration::from_secs(30);
+const PROGRESS_INTERVAL: Duration = Duration::from_secs(30);
 
 /// `rp ci`.
 #[derive(Args, Debug)]
@@ -262,7 +262,7 @@ impl Session {
             },
             guard: guard::start(command)?,
             began: Instant::now(),
-            next_progress: PROGRESS,
+            next_progress: PROGRESS_INTERVAL,
         })
     }
 
@@ -297,10 +297,10 @@ impl Session {
             if self.has_ended(signals)? {
                 return Ok(());
             }
-            std::thread::sleep(POLL);
+            std::thread::sleep(POLL_INTERVAL);
         }
         while !self.has_ended(signals)? {
-            std::thread::sleep(POLL);
+            std::thread::sleep(POLL_INTERVAL);
         }
         Ok(())
     }
@@ -314,12 +314,12 @@ impl Session {
         let mut deadline = None;
         loop {
             if deadline.is_none() && self.has_ended(signals)? {
-                deadline = Some(Instant::now() + LAST);
+                deadline = Some(Instant::now() + LAST_STATE_TIMEOUT);
             }
             if deadline.is_some_and(|deadline| Instant::now() >= deadline) {
                 return Ok(Ended::Command);
             }
-            let line = match lines.line_within(POLL) {
+            let line = match lines.line_within(POLL_INTERVAL) {
                 Ok(Next::Line(line)) => line,
                 Ok(Next::Nothing) => continue,
                 Ok(Next::End) => return Ok(Ended::Stream("the agent ended".to_owned())),
@@ -354,7 +354,7 @@ impl Session {
             print(&format!("{now:.0} s: {}", found.text));
         }
         if self.began.elapsed() >= self.next_progress {
-            self.next_progress += PROGRESS;
+            self.next_progress += PROGRESS_INTERVAL;
             let (nodes, topics) = (self.seen.nodes.len(), self.seen.topics.len());
             let lost: u64 = self.seen.topics.values().map(|it| it.lost.total()).sum();
             print(&format!(

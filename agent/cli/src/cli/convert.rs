@@ -44,7 +44,7 @@ pub(crate) struct Convert {
 }
 
 impl Convert {
-    pub(crate) fn ask(self) -> Result<ExitCode> {
-        self.record.of_capture(self.capture, self.bag).ask()
+    pub(crate) fn run(self) -> Result<ExitCode> {
+        self.record.of_capture(self.capture, self.bag).run()
     }
 }

@@ -17,7 +17,7 @@ use super::shared::names_of;
 use super::{Output, UserError};
 
 /// Interval between two views.
-const INTERVAL: Duration = Duration::from_secs(1);
+const VIEW_INTERVAL: Duration = Duration::from_secs(1);
 
 /// `rp diag`.
 #[derive(Args, Debug)]
@@ -45,7 +45,7 @@ pub(crate) struct Diag {
 type Key = (String, String, String);
 
 impl Diag {
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         let compile = |pattern: &String| {
             Regex::new(pattern).map_err(|_| {
                 UserError(format!("`{pattern}` is not a supported regular expression"))
@@ -80,19 +80,19 @@ impl Diag {
                 known.insert(key, status.level.clone().into_owned());
             }
             if is_first && printed == 0 {
-                eprintln!("rp: {}", self.nothing(&answer));
+                eprintln!("rp: {}", self.empty_reason(&answer));
                 names_of(&agent, domain_id)?;
             }
             if !self.follow {
                 return Ok(ExitCode::SUCCESS);
             }
             is_first = false;
-            std::thread::sleep(INTERVAL);
+            std::thread::sleep(VIEW_INTERVAL);
         }
     }
 
     /// Returns why nothing is printed.
-    fn nothing(&self, answer: &Diagnostics<'_>) -> Cow<'static, str> {
+    fn empty_reason(&self, answer: &Diagnostics<'_>) -> Cow<'static, str> {
         if answer.statuses.is_empty() {
             "no diagnostics were seen: nodes send them only if something subscribes to /diagnostics"
                 .into()

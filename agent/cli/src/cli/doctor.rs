@@ -63,7 +63,7 @@ pub(crate) struct Doctor {
 }
 
 impl Doctor {
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         if self.fix && !geteuid().is_root() {
             let text = "rp: --fix changes this host: run `sudo rp doctor --fix`".to_owned();
             return Err(UserError(text).into());
@@ -74,14 +74,14 @@ impl Doctor {
         }
         let report = if self.target.host.is_some() || self.target.replay.is_some() {
             let agent = Agent::reach(&self.target)?;
-            let answers = Answers::ask(&agent, self.target.domain_id)?;
+            let answers = Answers::request(&agent, self.target.domain_id)?;
             match self.target.replay {
                 Some(_) => examine_capture(&answers, &agent.place()),
                 None => examine_remote(&answers, &agent.place()),
             }
         } else {
             let configured = configured(self.config.as_deref())?;
-            examine(&HostState::read(), &configured, &reach(&self.target))
+            examine(&HostState::read(), &configured, &reach_agent(&self.target))
         };
         self.print(&report)?;
         if self.fix {
@@ -141,15 +141,15 @@ fn is_confirmed(output: &mut Output) -> Result<bool> {
 }
 
 /// Tries to reach the agent on this host.
-fn reach(target: &Target) -> Reach {
+fn reach_agent(target: &Target) -> Reach {
     let asked = Agent::reach(target).and_then(|agent| {
-        let answers = Answers::ask(&agent, target.domain_id)?;
+        let answers = Answers::request(&agent, target.domain_id)?;
         Ok((answers, agent.place()))
     });
     match asked {
         Ok((answers, place)) => Reach::Answered(Box::new(answers), place),
         Err(error @ ClientError::Denied { .. }) => Reach::Denied(error.to_string()),
-        Err(error) => Reach::Nobody(error.to_string()),
+        Err(error) => Reach::NoAnswer(error.to_string()),
     }
 }
 

@@ -24,7 +24,7 @@ use super::shared::{Matching, Spinning, names_of};
 use super::{Output, UserError};
 
 /// Moves the cursor home and clears the terminal.
-const CLEAR: &str = "\x1b[H\x1b[2J\n";
+const CLEAR_SCREEN: &str = "\x1b[H\x1b[2J\n";
 
 /// `rp topic echo`.
 #[derive(Args, Debug)]
@@ -64,7 +64,7 @@ pub(crate) struct Echo {
     #[arg(long)]
     once: bool,
     /// End after this many seconds
-    #[arg(long, value_name = "SECONDS", value_parser = positive)]
+    #[arg(long, value_name = "SECONDS", value_parser = parse_positive)]
     timeout: Option<f64>,
     /// Print times and sequence number before each message
     #[arg(long, short = 'i')]
@@ -90,7 +90,7 @@ pub(crate) struct Echo {
 }
 
 impl Echo {
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         let options = self.options()?;
         let name = full_name(&self.topic_name).map_err(user_error)?;
         if self.lost_messages {
@@ -115,10 +115,10 @@ impl Echo {
                 if !self.matching.any() {
                     output.write(&mixed_offers(&known.publishers))?;
                 }
-                self.expected(known)?
+                self.expected_type(known)?
             }
             None if self.message_type.is_none() && !is_waiting => {
-                return self.unknown(&agent, domain_id, &mut output);
+                return self.unknown_type(&agent, domain_id, &mut output);
             }
             None => self.message_type.clone(),
         };
@@ -129,7 +129,7 @@ impl Echo {
             types.find_for(&name, expected, hash)?;
         }
         if let Some(known) = &known {
-            hint(&name, known, expected.as_deref());
+            print_silence_reason(&name, known, expected.as_deref());
         }
         let names = std::slice::from_ref(&name);
         let mut notes = Notes::begin(&agent, domain_id, is_waiting, names, NOT_ALL_PRINTED);
@@ -161,7 +161,7 @@ impl Echo {
             dialect: self.target.dialect(),
             csv: self.printing.csv,
             style: self.printing.style(),
-            shown: self.printing.shown(),
+            shown: self.printing.truncation(),
             raw: self.raw,
             fields: fields
                 .collect::<Result<Vec<FieldPath>, _>>()
@@ -173,7 +173,7 @@ impl Echo {
 
     /// Returns the name of the expected type. Fails if the topic has several types and the command
     /// line names none.
-    fn expected(&self, known: &Topic<'_>) -> Result<Option<String>> {
+    fn expected_type(&self, known: &Topic<'_>) -> Result<Option<String>> {
         if self.message_type.is_some() {
             return Ok(self.message_type.clone());
         }
@@ -191,7 +191,7 @@ impl Echo {
         }
     }
 
-    fn unknown(&self, agent: &Agent, domain_id: u32, output: &mut Output) -> Result<ExitCode> {
+    fn unknown_type(&self, agent: &Agent, domain_id: u32, output: &mut Output) -> Result<ExitCode> {
         output.write(&format!(
             "WARNING: topic [{}] does not appear to be published yet\n",
             self.topic_name
@@ -252,7 +252,7 @@ impl Printer<'_> {
         if self.is_unknown()
             && let Some(known) = topic(self.agent, self.domain_id, self.name)?
         {
-            self.expected = self.command.expected(&known)?;
+            self.expected = self.command.expected_type(&known)?;
         }
         self.is_seen = true;
         let wanted = self
@@ -275,7 +275,7 @@ impl Printer<'_> {
             return Ok(false);
         };
         if self.command.clear {
-            self.output.write(CLEAR)?;
+            self.output.write(CLEAR_SCREEN)?;
         }
         self.output.write(&for_stdout(message))?;
         Ok(true)
@@ -292,8 +292,8 @@ impl Printer<'_> {
         if is_over && self.is_unknown() {
             let command = self.command;
             match topic(self.agent, self.domain_id, self.name)? {
-                Some(known) => drop(command.expected(&known)?),
-                None => return command.unknown(self.agent, self.domain_id, &mut self.output),
+                Some(known) => drop(command.expected_type(&known)?),
+                None => return command.unknown_type(self.agent, self.domain_id, &mut self.output),
             }
         }
         if self.echo.unreadable() > 1 {
@@ -304,7 +304,7 @@ impl Printer<'_> {
 }
 
 /// Prints the likely reason for silence.
-fn hint(name: &str, known: &Topic<'_>, expected: Option<&str>) {
+fn print_silence_reason(name: &str, known: &Topic<'_>, expected: Option<&str>) {
     let types = &known.message_types;
     if let Some(expected) = expected
         && !types.is_empty()
@@ -312,13 +312,13 @@ fn hint(name: &str, known: &Topic<'_>, expected: Option<&str>) {
     {
         eprintln!("rp: {name} carries {}, not {expected}", types.join(", "));
     }
-    for missing in missing_latched(name, &known.publishers) {
+    for missing in missing_latched_reasons(name, &known.publishers) {
         eprintln!("rp: {}", visible_lines(&missing));
     }
 }
 
 /// Returns why earlier messages of latched publishers are not printed.
-fn missing_latched(name: &str, publishers: &[Endpoint<'_>]) -> BTreeSet<String> {
+fn missing_latched_reasons(name: &str, publishers: &[Endpoint<'_>]) -> BTreeSet<String> {
     let latched = publishers
         .iter()
         .filter(|one| one.qos.durability == "TRANSIENT_LOCAL");
@@ -331,7 +331,7 @@ fn elapsed(start: i64, now: i64) -> f64 {
     now.saturating_sub(start) as f64 / 1e9
 }
 
-fn positive(text: &str) -> Result<f64, UserError> {
+fn parse_positive(text: &str) -> Result<f64, UserError> {
     let value = text
         .parse()
         .ok()

@@ -52,7 +52,7 @@ pub(crate) struct ActionEcho {
 }
 
 /// Parts of an action, and their topics below its name.
-const PARTS: [(&str, &str); 5] = [
+const ACTION_PARTS: [(&str, &str); 5] = [
     ("GOAL_SERVICE", "/_action/send_goal/_service_event"),
     ("CANCEL_SERVICE", "/_action/cancel_goal/_service_event"),
     ("RESULT_SERVICE", "/_action/get_result/_service_event"),
@@ -61,7 +61,7 @@ const PARTS: [(&str, &str); 5] = [
 ];
 
 impl ServiceEcho {
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         let name = full_name(&self.service_name).map_err(user_error)?;
         let events = format!("{name}/_service_event");
         let domain_id = self.target.domain()?;
@@ -98,8 +98,8 @@ impl ServiceEcho {
 }
 
 impl ActionEcho {
-    pub(crate) fn ask(self) -> Result<ExitCode> {
-        let parts = chosen(self.interfaces.as_deref()).map_err(user_error)?;
+    pub(crate) fn run(self) -> Result<ExitCode> {
+        let parts = selected_parts(self.interfaces.as_deref()).map_err(user_error)?;
         let name = full_name(&self.action_name).map_err(user_error)?;
         let domain_id = self.target.domain()?;
         if let Some(action_type) = &self.action_type {
@@ -125,9 +125,9 @@ impl ActionEcho {
 }
 
 /// Returns the parts that `--interfaces` selects. An unknown part fails with ros2cli's message.
-fn chosen(interfaces: Option<&str>) -> Result<Vec<(&'static str, &'static str)>, Refused> {
+fn selected_parts(interfaces: Option<&str>) -> Result<Vec<(&'static str, &'static str)>, Refused> {
     let Some(interfaces) = interfaces else {
-        return Ok(PARTS.to_vec());
+        return Ok(ACTION_PARTS.to_vec());
     };
     if interfaces.is_empty() {
         let text = "Input action interface name is empty.";
@@ -135,7 +135,7 @@ fn chosen(interfaces: Option<&str>) -> Result<Vec<(&'static str, &'static str)>,
     }
     let mut chosen = Vec::new();
     for name in interfaces.split('|').map(str::trim) {
-        let known = PARTS
+        let known = ACTION_PARTS
             .iter()
             .find(|(part, _)| part.eq_ignore_ascii_case(name));
         let part =
@@ -163,7 +163,7 @@ fn print(
         dialect: target.dialect(),
         csv: printing.csv,
         style: printing.style(),
-        shown: printing.shown(),
+        shown: printing.truncation(),
         ..echo::Options::default()
     });
     let names: Vec<_> = topics.iter().map(|(_, name)| name.clone()).collect();
@@ -199,11 +199,11 @@ mod tests {
 
     #[test]
     fn parts_of_an_action_are_chosen_by_name() {
-        assert_eq!(chosen(None).map(|parts| parts.len()), Ok(5));
-        let two = chosen(Some(" feedback_topic|STATUS_TOPIC | status_topic"));
+        assert_eq!(selected_parts(None).map(|parts| parts.len()), Ok(5));
+        let two = selected_parts(Some(" feedback_topic|STATUS_TOPIC | status_topic"));
         let two: Vec<_> = two.unwrap().into_iter().map(|(part, _)| part).collect();
         assert_eq!(two, ["FEEDBACK_TOPIC", "STATUS_TOPIC"]);
-        let refused = |text: &str| chosen(Some(text)).unwrap_err().0;
+        let refused = |text: &str| selected_parts(Some(text)).unwrap_err().0;
         assert_eq!(refused(""), "Input action interface name is empty.");
         assert_eq!(
             refused("x|STATUS_TOPIC"),

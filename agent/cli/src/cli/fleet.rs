@@ -10,7 +10,7 @@ use ros2probe::fleet::{self, Engine, Question};
 use super::{Output, UserError};
 
 /// Variable with the address of the engine.
-const VARIABLE: &str = "ROS2PROBE_ENGINE";
+const ENGINE_VARIABLE: &str = "ROS2PROBE_ENGINE";
 /// Maximum size of the file with a token, in bytes.
 const TOKEN_BYTES: u64 = 64 << 10;
 
@@ -49,13 +49,18 @@ pub(crate) struct Fleet {
 }
 
 /// Exit code if a robot is in trouble.
-const TROUBLE: u8 = 3;
+const EXIT_TROUBLE: u8 = 3;
 
 impl Fleet {
     pub(crate) fn print(self) -> Result<ExitCode> {
-        let named = || std::env::var(VARIABLE).ok().filter(|url| !url.is_empty());
+        let named = || {
+            std::env::var(ENGINE_VARIABLE)
+                .ok()
+                .filter(|url| !url.is_empty())
+        };
         let Some(url) = self.engine.or_else(named) else {
-            let text = format!("rp: no engine is named: pass --engine URL, or set {VARIABLE}");
+            let text =
+                format!("rp: no engine is named: pass --engine URL, or set {ENGINE_VARIABLE}");
             return Err(UserError(text).into());
         };
         let token = self.token_file.map(|path| {
@@ -87,7 +92,7 @@ impl Fleet {
             .iter()
             .any(|robot| robot.state < fleet::State::Findings);
         Ok(match is_in_trouble {
-            true => ExitCode::from(TROUBLE),
+            true => ExitCode::from(EXIT_TROUBLE),
             false => ExitCode::SUCCESS,
         })
     }

@@ -29,7 +29,7 @@ pub(crate) const AGENT_ENDED: &str = "the agent has ended: `systemctl status ros
 /// Note at the end of a replay.
 pub(crate) const END_OF_CAPTURE: &str = "end of capture";
 /// Minimum interval of requests for a definition that the agent does not have.
-const RETRY: Duration = Duration::from_secs(1);
+const DEFINITION_RETRY_INTERVAL: Duration = Duration::from_secs(1);
 /// Maximum number of writers with a remembered type.
 const MAX_WRITERS: usize = 1024;
 
@@ -61,7 +61,7 @@ pub(crate) struct Printing {
 }
 
 impl Printing {
-    pub(crate) fn shown(&self) -> Truncation {
+    pub(crate) fn truncation(&self) -> Truncation {
         Truncation {
             truncate: (!self.full_length).then_some(self.truncate_length),
             no_arrays: self.no_arr,
@@ -223,13 +223,13 @@ impl<'a> Types<'a> {
         hash: Option<&str>,
     ) -> Result<Arc<MessageType>> {
         if self.library.find(name, hash).is_err() {
-            self.learn(topic);
+            self.offer_definition(topic);
         }
         self.find(name, hash)
     }
 
     /// Adds the agent's definition of a topic's type. The library returns it only for its hash.
-    fn learn(&self, topic: &str) {
+    fn offer_definition(&self, topic: &str) {
         let Some((agent, domain_id)) = self.agent else {
             return;
         };
@@ -261,14 +261,16 @@ impl<'a> Types<'a> {
         match self.writers.get(&sample.writer) {
             Some(Ok(known)) => return Some(Arc::clone(known)),
             // A node may describe the type to the agent at any time.
-            Some(Err(at)) if self.agent.is_none() || at.elapsed() < RETRY => return None,
+            Some(Err(at)) if self.agent.is_none() || at.elapsed() < DEFINITION_RETRY_INTERVAL => {
+                return None;
+            }
             _ => {}
         }
         let offered = sample.offered.as_ref();
         let hash = offered.and_then(|offered| offered.definition_hash());
         let mut found = self.library.find(&sample.message_type, hash);
         if found.is_err() {
-            self.learn(&sample.topic);
+            self.offer_definition(&sample.topic);
             found = self.library.find(&sample.message_type, hash);
         }
         let found = match found {
@@ -312,7 +314,7 @@ impl MessageFilter {
         })
     }
 
-    pub(crate) fn passes(&mut self, sample: &Sample, payload: &[u8]) -> Result<bool> {
+    pub(crate) fn is_passed(&mut self, sample: &Sample, payload: &[u8]) -> Result<bool> {
         let Some(message_type) = self.types.of(sample) else {
             return Ok(false);
         };

@@ -32,12 +32,12 @@ pub(crate) struct Foxglove {
 }
 
 impl Foxglove {
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         let mut output = Output::new();
         if let Some((name, _)) = self.target.host.as_deref().map(parts)
             && !is_near(name)
         {
-            output.write(&tunnel(name))?;
+            output.write(&tunnel_command(name))?;
             return Ok(ExitCode::SUCCESS);
         }
         if self.target.replay.is_some() {
@@ -64,7 +64,7 @@ impl Foxglove {
 }
 
 /// Returns the SSH command that forwards the port of another host to this one.
-fn tunnel(name: &str) -> String {
+fn tunnel_command(name: &str) -> String {
     format!(
         "ssh -L {PORT}:127.0.0.1:{PORT} {name}\n\
          # then open ws://localhost:{PORT}/ here; `rp foxglove` on {name} prints it with a token\n"
@@ -77,7 +77,7 @@ mod tests {
 
     #[test]
     fn the_ssh_command_forwards_the_port_for_viewers() {
-        let shown = tunnel("pi@robot1");
+        let shown = tunnel_command("pi@robot1");
         assert!(
             shown.starts_with("ssh -L 8765:127.0.0.1:8765 pi@robot1\n"),
             "{shown}"

@@ -45,7 +45,7 @@ pub(crate) struct Inside {
 }
 
 impl Inside {
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         let agent = Agent::reach(&self.target)?;
         let path = match &self.name {
             Some(name) => format!("/inside?name={}", encoded(name)),

@@ -10,7 +10,7 @@ use rustix::process::Signal;
 use tokio::signal::unix::{SignalKind, signal};
 
 /// ros2cli's default exit code after Ctrl-C.
-pub(crate) const INTERRUPTED: u8 = 2;
+pub(crate) const EXIT_INTERRUPTED: u8 = 2;
 
 /// Makes Ctrl-C end the process with `code`.
 ///
@@ -42,9 +42,9 @@ pub(crate) fn listen(code: u8) -> io::Result<()> {
 pub(crate) fn flag() -> io::Result<Arc<AtomicBool>> {
     let flag = Arc::new(AtomicBool::new(false));
     let is_set = Arc::clone(&flag);
-    on_each(move |_| {
+    on_each_signal(move |_| {
         if is_set.swap(true, Ordering::Relaxed) {
-            std::process::exit(INTERRUPTED.into());
+            std::process::exit(EXIT_INTERRUPTED.into());
         }
         true
     })?;
@@ -58,12 +58,12 @@ pub(crate) fn flag() -> io::Result<Arc<AtomicBool>> {
 /// Fails if the signal handlers cannot be installed.
 pub(crate) fn signals() -> io::Result<Receiver<Signal>> {
     let (give, signals) = channel();
-    on_each(move |signal| give.send(signal).is_ok())?;
+    on_each_signal(move |signal| give.send(signal).is_ok())?;
     Ok(signals)
 }
 
 /// Calls `act` on a thread for each SIGINT and SIGTERM, until it returns false.
-fn on_each(mut act: impl FnMut(Signal) -> bool + Send + 'static) -> io::Result<()> {
+fn on_each_signal(mut act: impl FnMut(Signal) -> bool + Send + 'static) -> io::Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_io()
         .build()?;

@@ -28,9 +28,9 @@ use super::{Output, UserError};
 use file::Destination;
 
 /// Interval between two views of the topics.
-const INTERVAL: Duration = Duration::from_secs(1);
+const VIEW_INTERVAL: Duration = Duration::from_secs(1);
 /// Maximum wait for a line before the flag of Ctrl-C is checked.
-const POLL: Duration = Duration::from_millis(100);
+const POLL_INTERVAL: Duration = Duration::from_millis(100);
 /// Size of the stream's queue, in bytes. The stream's lines are discarded.
 const QUEUE_BYTES: usize = 64 << 10;
 const MAX_MINUTES: u16 = (MAX_SECONDS / 60) as u16;
@@ -62,7 +62,7 @@ pub(crate) struct Learn {
 }
 
 impl Learn {
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         let selection = Selection::new(&self.topics)
             .map_err(|(typed, error)| UserError(format!("rp: the topic `{typed}` {error}")))?;
         let domain_id = self.target.domain()?;
@@ -136,22 +136,22 @@ impl Session {
         let (query, domain_id) = (&self.query, self.domain_id);
         let path = format!("/samples?{query}&domain_id={domain_id}&queue_bytes={QUEUE_BYTES}");
         let mut lines = agent.stream(&path)?;
-        self.view_while(&mut lines, agent)?;
+        self.view_until_end(&mut lines, agent)?;
         let begin = Instant::now();
         let end = begin + Duration::from_secs(self.seconds.into());
-        let mut due = begin + INTERVAL;
+        let mut due = begin + VIEW_INTERVAL;
         let mut is_explained = false;
-        while !self.is_over(Instant::now() >= end) {
+        while !self.is_finished(Instant::now() >= end) {
             let left = due.saturating_duration_since(Instant::now());
             if left.is_zero() {
-                self.view_while(&mut lines, agent)?;
-                due += INTERVAL;
+                self.view_until_end(&mut lines, agent)?;
+                due += VIEW_INTERVAL;
                 if !std::mem::replace(&mut is_explained, true) {
-                    self.explain_unseen();
+                    self.print_unseen_reason();
                 }
                 continue;
             }
-            match lines.line_within(left.min(POLL))? {
+            match lines.line_within(left.min(POLL_INTERVAL))? {
                 Next::Line(line) if !is_end(&line) => {}
                 Next::Nothing => {}
                 Next::Line(_) | Next::End => return Err(agent_ended().into()),
@@ -162,10 +162,10 @@ impl Session {
 
     /// Views the topics. A request fails shortly before the stream of an agent that is stopping
     /// ends.
-    fn view_while(&mut self, lines: &mut Lines<'_>, agent: &Agent) -> Result<()> {
+    fn view_until_end(&mut self, lines: &mut Lines<'_>, agent: &Agent) -> Result<()> {
         let viewed = self.view(agent);
         match viewed {
-            Err(_) if ends_soon(lines) => Err(agent_ended().into()),
+            Err(_) if ends_within_a_second(lines) => Err(agent_ended().into()),
             viewed => viewed,
         }
     }
@@ -177,7 +177,7 @@ impl Session {
             return Ok(());
         };
         let mut next = begin.floor() + 1.0;
-        while !self.is_over(self.learner.seconds() >= self.seconds) {
+        while !self.is_finished(self.learner.seconds() >= self.seconds) {
             let time: Result<CaptureTime, _> = format!("{next:.0}").parse();
             let Ok(time) = time else { break };
             if !agent.advance(time) {
@@ -189,7 +189,7 @@ impl Session {
         Ok(())
     }
 
-    fn is_over(&self, is_complete: bool) -> bool {
+    fn is_finished(&self, is_complete: bool) -> bool {
         is_complete || self.stop.load(Ordering::Relaxed)
     }
 
@@ -202,7 +202,7 @@ impl Session {
         Ok(())
     }
 
-    fn explain_unseen(&mut self) {
+    fn print_unseen_reason(&mut self) {
         let unseen: Vec<_> = self.learner.unseen().collect();
         if !unseen.is_empty() {
             let unseen = unseen.join(", ");
@@ -250,7 +250,7 @@ impl Session {
         let seconds = self.learner.seconds();
         eprintln!(
             "rp: expectations for {expected} of {all} topics, learnt in {seconds} s{}",
-            output.phrase()
+            output.result_text()
         );
     }
 }
@@ -264,7 +264,7 @@ fn is_end(line: &[u8]) -> bool {
 }
 
 /// Returns whether the stream ends within a second.
-fn ends_soon(lines: &mut Lines<'_>) -> bool {
+fn ends_within_a_second(lines: &mut Lines<'_>) -> bool {
     let deadline = Instant::now() + Duration::from_secs(1);
     while let Some(left) = deadline.checked_duration_since(Instant::now()) {
         match lines.line_within(left) {
@@ -296,23 +296,23 @@ fn time(seconds: f64) -> String {
 
 /// A line on stderr that is updated in place; nothing if stderr is not a terminal.
 struct Progress {
-    is_shown: bool,
+    is_visible: bool,
     /// Whether the command ends with a capture, at an unknown time.
-    is_whole: bool,
+    is_of_capture: bool,
 }
 
 impl Progress {
     fn new(is_whole: bool) -> Self {
         Self {
-            is_shown: stderr().is_terminal(),
-            is_whole,
+            is_visible: stderr().is_terminal(),
+            is_of_capture: is_whole,
         }
     }
 
     fn show(&self, learner: &Learner, seconds: u32) {
-        if self.is_shown {
+        if self.is_visible {
             let (topics, now) = (learner.topics(), learner.seconds());
-            let all = match self.is_whole {
+            let all = match self.is_of_capture {
                 true => "the capture".to_owned(),
                 false => format!("{}:{:02}", seconds / 60, seconds % 60),
             };
@@ -324,7 +324,7 @@ impl Progress {
     }
 
     fn clear(&self) {
-        if self.is_shown {
+        if self.is_visible {
             eprint!("\r\x1b[K");
         }
     }

@@ -17,7 +17,7 @@ use super::follow::{StreamItem, StreamStatus, follow};
 use super::notes::{NOT_ALL_PRINTED, Notes};
 use super::{Output, UserError};
 
-const ROSOUT: &str = "/rosout";
+const ROSOUT_TOPIC: &str = "/rosout";
 
 /// `rp log`.
 #[derive(Args, Debug)]
@@ -94,7 +94,7 @@ struct Printer<'a> {
 }
 
 impl Log {
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         let compile = |pattern| {
             let refused = format!("--grep: `{pattern}` is not a supported regular expression");
             expression(pattern).map_err(|_| UserError(refused))
@@ -111,16 +111,16 @@ impl Log {
         // A capture is read from its begin.
         let is_replay = self.target.replay.is_some();
         if self.no_follow && !is_replay {
-            printer.earlier(&agent, domain_id)?;
+            printer.print_kept(&agent, domain_id)?;
             return Ok(ExitCode::SUCCESS);
         }
-        let names = [ROSOUT.to_owned()];
+        let names = [ROSOUT_TOPIC.to_owned()];
         let mut notes = Notes::begin(&agent, domain_id, is_replay, &names, NOT_ALL_PRINTED);
         let mut has_begun = is_replay;
         let status = follow(&agent, domain_id, &names, &mut notes, |item, _| {
             // The stream is open now, so no message is missing between both.
             if !std::mem::replace(&mut has_begun, true) {
-                printer.earlier(&agent, domain_id)?;
+                printer.print_kept(&agent, domain_id)?;
             }
             if let StreamItem::Message(sample, payload) = item
                 && sample.message_type == TYPE
@@ -142,7 +142,7 @@ impl Log {
 
 impl Printer<'_> {
     /// Prints the latest messages that the agent keeps.
-    fn earlier(&mut self, agent: &Agent, domain_id: u32) -> Result<()> {
+    fn print_kept(&mut self, agent: &Agent, domain_id: u32) -> Result<()> {
         let logs: Logs<'_> = agent.get(&format!("/logs?domain_id={domain_id}&limit=1000"))?;
         if !logs.is_on {
             eprintln!("rp: the agent keeps no logs: `robot.logs` is `off`");

@@ -140,23 +140,23 @@ impl Question {
             interrupt::listen(code)?;
         }
         match self {
-            Self::Bag(bag) => bag.ask(),
-            Self::Topic(topic) => topic.ask(),
-            Self::Node(node) => node.ask(),
-            Self::Service(service) => service.ask(),
-            Self::Action(action) => action.ask(),
-            Self::Chain(chain) => chain.ask(),
-            Self::Log(log) => log.ask(),
-            Self::Diag(diag) => diag.ask(),
-            Self::Param(param) => param.ask(),
-            Self::Tf(tf) => tf.ask(),
-            Self::Doctor(doctor) => doctor.ask(),
-            Self::Top(top) => top.ask(),
-            Self::Inside(inside) => inside.ask(),
-            Self::Why(why) => why.ask(),
-            Self::Learn(learn) => learn.ask(),
-            Self::Page(page) => page.ask(),
-            Self::Foxglove(foxglove) => foxglove.ask(),
+            Self::Bag(bag) => bag.run(),
+            Self::Topic(topic) => topic.run(),
+            Self::Node(node) => node.run(),
+            Self::Service(service) => service.run(),
+            Self::Action(action) => action.run(),
+            Self::Chain(chain) => chain.run(),
+            Self::Log(log) => log.run(),
+            Self::Diag(diag) => diag.run(),
+            Self::Param(param) => param.run(),
+            Self::Tf(tf) => tf.run(),
+            Self::Doctor(doctor) => doctor.run(),
+            Self::Top(top) => top.run(),
+            Self::Inside(inside) => inside.run(),
+            Self::Why(why) => why.run(),
+            Self::Learn(learn) => learn.run(),
+            Self::Page(page) => page.run(),
+            Self::Foxglove(foxglove) => foxglove.run(),
         }
     }
 
@@ -177,7 +177,7 @@ impl Question {
             | Self::Inside(_)
             | Self::Why(_)
             | Self::Page(_)
-            | Self::Foxglove(_) => Some(interrupt::INTERRUPTED),
+            | Self::Foxglove(_) => Some(interrupt::EXIT_INTERRUPTED),
             // `top` restores the terminal first, and `learn` writes what it has learnt.
             Self::Top(_) | Self::Learn(_) => None,
         }

@@ -53,7 +53,7 @@ struct Info {
 }
 
 impl Node {
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         match self.verb {
             None => super::help(&["node"]),
             Some(Verb::List(list)) => list.ask(),

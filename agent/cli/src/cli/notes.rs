@@ -20,15 +20,15 @@ use ros2probe_daemon::recording::{GraphSnapshot, PublishedTopic};
 use super::shared::names_of;
 
 /// Silence after which the reason is requested.
-pub(crate) const SILENT: Duration = Duration::from_secs(5);
+pub(crate) const SILENCE_TIMEOUT: Duration = Duration::from_secs(5);
 /// Minimum time between two reports of a topic's missing messages.
-const PAUSE: Duration = Duration::from_secs(5);
+const MIN_REPORT_INTERVAL: Duration = Duration::from_secs(5);
 /// Consequence of sampling for verbs that print messages.
 pub(crate) const NOT_ALL_PRINTED: &str = "not every message is printed";
 /// Maximum number of topics named in one line.
-const NAMES: usize = 8;
+const MAX_NAMED_TOPICS: usize = 8;
 /// Remedy for sampled topics.
-const SWITCH: &str = "`capture.shm.exact: auto` captures each message";
+const SAMPLING_REMEDY: &str = "`capture.shm.exact: auto` captures each message";
 
 /// Notes on the topics of one verb.
 pub(crate) struct Notes<'a> {
@@ -42,7 +42,7 @@ pub(crate) struct Notes<'a> {
     /// Consequence of sampling for this verb.
     consequence: &'static str,
     sampling: Sampling,
-    heard: HashSet<String>,
+    received_topics: HashSet<String>,
     sampled: HashSet<String>,
     begun: Instant,
     is_explained: bool,
@@ -50,7 +50,7 @@ pub(crate) struct Notes<'a> {
 
 /// Missing messages that are not reported yet. The variable is global, because Ctrl-C may end the
 /// process. A process runs only one verb.
-static MISSING: Mutex<Missing> = Mutex::new(Missing(BTreeMap::new()));
+static MISSING_MESSAGES: Mutex<Missing> = Mutex::new(Missing(BTreeMap::new()));
 
 /// Missing messages by topic and reason: the unreported count, and the time of the last report.
 struct Missing(BTreeMap<(String, &'static str), (u64, Option<Instant>)>);
@@ -58,7 +58,7 @@ struct Missing(BTreeMap<(String, &'static str), (u64, Option<Instant>)>);
 /// Reports missing messages before the process ends.
 pub(crate) fn end() {
     // If another thread holds the lock, it is blocked on stderr.
-    if let Ok(mut missing) = MISSING.try_lock() {
+    if let Ok(mut missing) = MISSING_MESSAGES.try_lock() {
         missing.report(true);
     }
 }
@@ -84,7 +84,7 @@ impl<'a> Notes<'a> {
                 true => Sampling::Nothing,
                 false => Sampling::at(agent),
             },
-            heard: HashSet::new(),
+            received_topics: HashSet::new(),
             sampled: HashSet::new(),
             begun: Instant::now(),
             is_explained: false,
@@ -117,8 +117,8 @@ impl<'a> Notes<'a> {
         if is_new && self.sampling.is_known(self.agent, self.begun) {
             self.print_sampled(&[topic.to_owned()]);
         }
-        if !self.heard.contains(topic) {
-            self.heard.insert(topic.to_owned());
+        if !self.received_topics.contains(topic) {
+            self.received_topics.insert(topic.to_owned());
         }
     }
 
@@ -136,13 +136,13 @@ impl<'a> Notes<'a> {
         missing.report(false);
     }
 
-    /// Reports once why no message arrived, after [`SILENT`].
+    /// Reports once why no message arrived, after [`SILENCE_TIMEOUT`].
     pub(crate) fn now(&mut self) -> Result<()> {
         Missing::all().report(false);
-        if self.is_replay || self.is_explained || self.begun.elapsed() < SILENT {
+        if self.is_replay || self.is_explained || self.begun.elapsed() < SILENCE_TIMEOUT {
             return Ok(());
         }
-        self.explain()
+        self.print_explanation()
     }
 
     /// At the end of the stream, reports missing messages and the reason for silence.
@@ -151,19 +151,19 @@ impl<'a> Notes<'a> {
         if self.is_explained {
             return Ok(());
         }
-        self.explain()
+        self.print_explanation()
     }
 
-    fn explain(&mut self) -> Result<()> {
+    fn print_explanation(&mut self) -> Result<()> {
         self.is_explained = true;
-        if self.are_parts && !self.heard.is_empty() {
+        if self.are_parts && !self.received_topics.is_empty() {
             return Ok(());
         }
-        if self.names.is_empty() && self.heard.is_empty() {
+        if self.names.is_empty() && self.received_topics.is_empty() {
             names_of(self.agent, self.domain_id)?;
         }
         for name in &self.names {
-            if self.heard.contains(name) {
+            if self.received_topics.contains(name) {
                 continue;
             }
             let path = path(name, self.domain_id);
@@ -262,7 +262,9 @@ impl<'a> Notes<'a> {
 
 impl Missing {
     fn all() -> MutexGuard<'static, Self> {
-        MISSING.lock().unwrap_or_else(PoisonError::into_inner)
+        MISSING_MESSAGES
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
     }
 
     fn add(&mut self, key: (String, &'static str), samples: u64) {
@@ -278,7 +280,7 @@ impl Missing {
     fn due(&mut self, at_end: bool) -> Vec<String> {
         let mut lines = Vec::new();
         for ((topic, why), (count, reported)) in &mut self.0 {
-            let is_due = reported.is_none_or(|reported| reported.elapsed() >= PAUSE);
+            let is_due = reported.is_none_or(|reported| reported.elapsed() >= MIN_REPORT_INTERVAL);
             if *count == 0 || !is_due && !at_end {
                 continue;
             }
@@ -322,7 +324,7 @@ impl Sampling {
             // remedy.
             exact => {
                 let reason = exact.and_then(|exact| exact.reason.clone());
-                Self::Sampled(reason.unwrap_or_else(|| SWITCH.to_owned()))
+                Self::Sampled(reason.unwrap_or_else(|| SAMPLING_REMEDY.to_owned()))
             }
         }
     }
@@ -331,7 +333,7 @@ impl Sampling {
     /// `begun`, they do not.
     pub(crate) fn is_known(&mut self, agent: &Agent, begun: Instant) -> bool {
         if matches!(self, Self::OnDemand) {
-            if begun.elapsed() < SILENT {
+            if begun.elapsed() < SILENCE_TIMEOUT {
                 return false;
             }
             *self = match Self::at(agent) {
@@ -348,7 +350,7 @@ impl Sampling {
         let Self::Sampled(remedy) = self else {
             return None;
         };
-        let names = few(topics);
+        let names = shortened_list(topics);
         let verb = if topics.len() == 1 { "is" } else { "are" };
         let text = format!("{names} {verb} sampled in shared memory; {consequence}; {remedy}");
         (!topics.is_empty()).then_some(text)
@@ -374,10 +376,14 @@ fn counted_inside(topic: &Topic<'_>) -> Option<String> {
     ))
 }
 
-fn few(names: &[String]) -> String {
-    let shown: Vec<&str> = names.iter().take(NAMES).map(String::as_str).collect();
+fn shortened_list(names: &[String]) -> String {
+    let shown: Vec<&str> = names
+        .iter()
+        .take(MAX_NAMED_TOPICS)
+        .map(String::as_str)
+        .collect();
     let shown = shown.join(", ");
-    match names.len().saturating_sub(NAMES) {
+    match names.len().saturating_sub(MAX_NAMED_TOPICS) {
         0 => shown,
         more => format!("{shown} and {more} more"),
     }
@@ -427,7 +433,7 @@ mod tests {
     #[test]
     fn a_long_list_of_sampled_topics_is_one_line() {
         let names: Vec<String> = (0..10).map(|number| format!("/t{number}")).collect();
-        let sampling = Sampling::Sampled(SWITCH.to_owned());
+        let sampling = Sampling::Sampled(SAMPLING_REMEDY.to_owned());
         let text = sampling.text(&names, NOT_ALL_PRINTED).unwrap();
         assert!(text.starts_with("/t0, /t1, "), "{text}");
         assert!(
@@ -449,7 +455,7 @@ mod tests {
             Sampling::of(&health).text(&["/imu".to_owned()], NOT_ALL_PRINTED)
         };
         let off = text(r#""able":false"#).unwrap();
-        assert!(off.ends_with(SWITCH), "{off}");
+        assert!(off.ends_with(SAMPLING_REMEDY), "{off}");
         let resting = r#""able":false,"on_demand":true,"reason":"no client reads samples""#;
         assert_eq!(text(resting), None);
         assert_eq!(text(r#""able":true"#), None);

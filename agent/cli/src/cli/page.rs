@@ -12,9 +12,9 @@ use serde_json::json;
 use super::{Output, UserError};
 
 /// Default port of the API.
-const PORT: &str = "17401";
+const API_PORT: &str = "17401";
 /// Program that opens an address in the browser of a desktop.
-const OPENER: &str = "xdg-open";
+const BROWSER_OPENER: &str = "xdg-open";
 
 /// `rp page`.
 #[derive(Args, Debug)]
@@ -37,7 +37,7 @@ pub(crate) struct Page {
 }
 
 impl Page {
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         let mut output = Output::new();
         let near = match self.target.host.as_deref().map(parts) {
             Some((name, port)) if !is_near(name) => {
@@ -72,7 +72,7 @@ impl Page {
 pub(super) fn parts(host: &str) -> (&str, &str) {
     match host.rsplit_once(':') {
         Some((name, port)) if !name.ends_with(':') && port.parse::<u16>().is_ok() => (name, port),
-        _ => (host, PORT),
+        _ => (host, API_PORT),
     }
 }
 
@@ -91,7 +91,7 @@ fn tunnel(name: &str, port: &str) -> String {
 }
 
 fn open(address: &str) -> Result<()> {
-    let opened = Command::new(OPENER)
+    let opened = Command::new(BROWSER_OPENER)
         .arg(address)
         .stdin(Stdio::null())
         .stdout(Stdio::null())
@@ -100,7 +100,8 @@ fn open(address: &str) -> Result<()> {
     match opened {
         Ok(status) if status.success() => Ok(()),
         _ => {
-            let reason = format!("{OPENER} does not open it: copy the address into a browser");
+            let reason =
+                format!("{BROWSER_OPENER} does not open it: copy the address into a browser");
             Err(UserError(reason).into())
         }
     }

@@ -16,7 +16,7 @@ use super::Output;
 use super::shared::names_of;
 
 /// Interval between two views.
-const INTERVAL: Duration = Duration::from_millis(500);
+const VIEW_INTERVAL: Duration = Duration::from_millis(500);
 
 /// `rp param`.
 #[derive(Args, Debug)]
@@ -56,7 +56,7 @@ struct Changes {
 }
 
 impl Param {
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         match self.command {
             Command::Dump(dump) => dump.ask(),
             Command::Changes(changes) => changes.ask(),
@@ -125,7 +125,7 @@ impl Changes {
                 printed = answer.changes;
             }
             is_first = false;
-            std::thread::sleep(INTERVAL);
+            std::thread::sleep(VIEW_INTERVAL);
         }
     }
 }

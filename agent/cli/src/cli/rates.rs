@@ -16,22 +16,22 @@ use ros2probe_api::path::encoded;
 use ros2probe_api::samples::{Line, MissedReason, Sample};
 
 use super::follow::{AGENT_ENDED, END_OF_CAPTURE, MessageFilter, library};
-use super::interrupt::INTERRUPTED;
+use super::interrupt::EXIT_INTERRUPTED;
 use super::notes::Notes;
 use super::shared::{Matching, Spinning, names_of};
 use super::{Output, UserError};
 
 /// Default window of `hz` and `delay`, in messages.
-const LONG: usize = 10_000;
+const RATE_WINDOW: usize = 10_000;
 /// Default window of `bw`, in messages.
-const SHORT: usize = 100;
+const BANDWIDTH_WINDOW: usize = 100;
 /// `rp topic hz`.
 #[derive(Args, Debug)]
 pub(crate) struct Hz {
     #[command(flatten)]
     topics: Topics,
     /// Number of newest intervals to calculate from
-    #[arg(long, short = 'w', value_name = "WINDOW", default_value_t = LONG, value_parser = positive)]
+    #[arg(long, short = 'w', value_name = "WINDOW", default_value_t = RATE_WINDOW, value_parser = positive)]
     window: usize,
     /// Count only messages that match this expression over `m`, the message, as in `rp topic echo`
     #[arg(long, value_name = "EXPR")]
@@ -52,7 +52,7 @@ pub(crate) struct Bandwidth {
     #[command(flatten)]
     topics: Topics,
     /// Number of newest messages to calculate from
-    #[arg(long, short = 'w', value_name = "WINDOW", default_value_t = SHORT, value_parser = positive)]
+    #[arg(long, short = 'w', value_name = "WINDOW", default_value_t = BANDWIDTH_WINDOW, value_parser = positive)]
     window: usize,
     #[command(flatten)]
     options: Options,
@@ -64,7 +64,7 @@ pub(crate) struct Delay {
     #[command(flatten)]
     topics: Topics,
     /// Number of newest messages to calculate from
-    #[arg(long, short = 'w', value_name = "WINDOW", default_value_t = LONG, value_parser = positive)]
+    #[arg(long, short = 'w', value_name = "WINDOW", default_value_t = RATE_WINDOW, value_parser = positive)]
     window: usize,
     #[command(flatten)]
     options: Options,
@@ -91,7 +91,7 @@ struct Options {
 }
 
 impl Hz {
-    pub(crate) fn ask(self, hidden: bool) -> Result<ExitCode> {
+    pub(crate) fn run(self, hidden: bool) -> Result<ExitCode> {
         let target = &self.options.target;
         let library = || library(target, self.definitions);
         let sieve = self
@@ -115,7 +115,7 @@ impl Hz {
 }
 
 impl Bandwidth {
-    pub(crate) fn ask(self, hidden: bool) -> Result<ExitCode> {
+    pub(crate) fn run(self, hidden: bool) -> Result<ExitCode> {
         measure(
             Quantity::Bandwidth,
             self.window,
@@ -133,7 +133,7 @@ impl Bandwidth {
 }
 
 impl Delay {
-    pub(crate) fn ask(self, hidden: bool) -> Result<ExitCode> {
+    pub(crate) fn run(self, hidden: bool) -> Result<ExitCode> {
         measure(
             Quantity::Delay,
             self.window,
@@ -148,7 +148,7 @@ impl Delay {
 /// Returns the exit code after Ctrl-C: 0 in `first` and later distributions.
 fn since(first: Dialect, target: &Target) -> u8 {
     if target.dialect() < first {
-        INTERRUPTED
+        EXIT_INTERRUPTED
     } else {
         0
     }
@@ -284,7 +284,7 @@ impl Measurement<'_> {
             header_stamp: sample.header_stamp_ns,
         };
         let passes = match &mut self.sieve {
-            Some(sieve) => sieve.passes(sample, payload)?,
+            Some(sieve) => sieve.is_passed(sample, payload)?,
             None => true,
         };
         let types = std::slice::from_ref(&sample.message_type);
@@ -301,7 +301,7 @@ impl Measurement<'_> {
                 };
                 self.rates.arrived_from(&sample.topic, arrival, origin)
             }
-            true => self.rates.arrived(&sample.topic, arrival),
+            true => self.rates.add_message(&sample.topic, arrival),
         }))
     }
 }

@@ -35,7 +35,7 @@ use read_ahead::ReadAhead;
 use signals::{Phase, listen};
 
 /// Default size of messages that wait for the storage, in bytes, as in `ros2 bag record`.
-const CACHE: u64 = 100 << 20;
+const DEFAULT_CACHE_BYTES: u64 = 100 << 20;
 
 /// `rp bag record`.
 #[derive(Args, Debug)]
@@ -113,7 +113,7 @@ pub(crate) struct Record {
     max_bag_duration: u64,
     /// Bytes of messages that may wait for the storage in this process. Further messages wait in
     /// the agent, and those that do not fit there are dropped, counted and reported
-    #[arg(long, value_name = "BYTES", default_value_t = CACHE)]
+    #[arg(long, value_name = "BYTES", default_value_t = DEFAULT_CACHE_BYTES)]
     max_cache_size: u64,
     /// Compress files after they are complete: file
     #[arg(long, value_name = "none|file", default_value = "none")]
@@ -190,12 +190,12 @@ impl Record {
         self
     }
 
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         let phase = Phase::starting();
         let (give, commands) = channel();
         listen(give.clone(), phase.clone())?;
         let dialect = self.target.dialect();
-        let filter = Filter::new(self.asked(dialect)?).map_err(|error| refused(&error))?;
+        let filter = Filter::new(self.options_from(dialect)?).map_err(|error| refused(&error))?;
         let options = self.options()?;
         let domain_id = self.target.domain()?;
         let directory = self.directory()?;
@@ -208,7 +208,7 @@ impl Record {
         let filter = if self.no_discovery {
             let opened = samples.opened().topics.iter();
             let there: Vec<_> = opened.map(|topic| topic.topic.clone()).collect();
-            filter.only(&there)
+            filter.restricted_to(&there)
         } else {
             filter
         };
@@ -300,13 +300,13 @@ impl Record {
     fn begun<'a>(&self, mut recorder: Recorder<'a>) -> Recorder<'a> {
         if self.snapshot_mode {
             let room = usize::try_from(self.max_cache_size).unwrap_or(usize::MAX);
-            recorder = recorder.waiting_in(SampleRing::new(room, None));
+            recorder = recorder.with_ring(SampleRing::new(room, None));
         }
         recorder.pause(self.start_paused);
         recorder
     }
 
-    fn asked(&self, dialect: Dialect) -> Result<FilterOptions> {
+    fn options_from(&self, dialect: Dialect) -> Result<FilterOptions> {
         let full = |names: &[String]| -> Result<Vec<String>> {
             let names = names.iter().map(|name| full_name(name));
             let names: Result<_, _> = names.collect();

@@ -10,7 +10,7 @@ use ros2probe::ros2::{service, topic};
 use ros2probe_api::names::{Names, ServiceName};
 
 use super::events::ServiceEcho;
-use super::shared::{Graph, Spinning, answer, print_found, print_or_fail, print_text};
+use super::shared::{Graph, Spinning, answer, print_names, print_or_fail, print_text};
 
 /// `rp service VERB`.
 #[derive(Args, Debug)]
@@ -89,7 +89,7 @@ struct Info {
 }
 
 impl Service {
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         let hidden = self.include_hidden_services;
         match self.verb {
             None => super::help(&["service"]),
@@ -97,7 +97,7 @@ impl Service {
             Some(Verb::Type(kind)) => kind.ask(hidden),
             Some(Verb::Find(find)) => find.ask(hidden),
             Some(Verb::Info(info)) => info.ask(hidden),
-            Some(Verb::Echo(echo)) => echo.ask(),
+            Some(Verb::Echo(echo)) => echo.run(),
         }
     }
 }
@@ -129,7 +129,7 @@ impl Find {
         let found = |names: &Names<'_>, count| {
             topic::find(&self.service_type, shown(names, hidden).map(typed), count)
         };
-        print_found(&graph, self.count_services, found)
+        print_names(&graph, self.count_services, found)
     }
 }
 

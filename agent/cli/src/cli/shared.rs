@@ -14,7 +14,7 @@ use ros2probe_api::path::encoded;
 use ros2probe_api::problem::Code;
 use ros2probe_api::services::ServiceList;
 use ros2probe_api::topics::Topic;
-use ros2probe_daemon::missed_announcements::{DISCOVER, explanation, sentence};
+use ros2probe_daemon::missed_announcements::{DISCOVER_COMMAND, explanation, sentence};
 use serde::de::DeserializeOwned;
 
 use super::{Output, UserError};
@@ -96,19 +96,19 @@ impl Graph {
         let names = fetch(&self.agent, self.domain_id)?;
         let answer = answer(&names);
         if answer.is_none() {
-            explain(&names, &self.agent, self.domain_id);
+            print_missing_reason(&names, &self.agent, self.domain_id);
         }
         Ok(answer)
     }
 
     /// Returns the topic of this name; `None` if it does not exist.
     pub(crate) fn topic(&self, name: &str) -> Result<Option<Topic<'static>>> {
-        self.thing("topics", name, Code::NoSuchTopic)
+        self.noun("topics", name, Code::NoSuchTopic)
     }
 
     /// Returns the node of this name, with hidden entities; `None` if it does not exist.
     pub(crate) fn node(&self, name: &str) -> Result<Option<Node<'static>>> {
-        self.thing("nodes", name, Code::NoSuchNode)
+        self.noun("nodes", name, Code::NoSuchNode)
     }
 
     /// Returns all services, including hidden ones, with their calls.
@@ -118,7 +118,7 @@ impl Graph {
         Ok(self.agent.get_visible(&path)?)
     }
 
-    fn thing<T: DeserializeOwned>(&self, noun: &str, name: &str, code: Code) -> Result<Option<T>> {
+    fn noun<T: DeserializeOwned>(&self, noun: &str, name: &str, code: Code) -> Result<Option<T>> {
         let Some(name) = name.strip_prefix('/').filter(|name| !name.is_empty()) else {
             return Ok(None);
         };
@@ -137,13 +137,13 @@ impl Graph {
 }
 
 /// Whether the note about missing names has been printed.
-static EXPLAINED: Once = Once::new();
+static EXPLANATION_PRINTED: Once = Once::new();
 
 /// Returns all names in a domain, including hidden ones. The reason for missing names is printed
 /// once on stderr.
 pub(crate) fn names_of(agent: &Agent, domain_id: u32) -> Result<Names<'static>> {
     let names = fetch(agent, domain_id)?;
-    explain(&names, agent, domain_id);
+    print_missing_reason(&names, agent, domain_id);
     Ok(names)
 }
 
@@ -152,7 +152,7 @@ fn fetch(agent: &Agent, domain_id: u32) -> Result<Names<'static>> {
 }
 
 /// Prints why names may be missing, if there is a reason.
-fn explain(names: &Names<'_>, agent: &Agent, domain_id: u32) {
+fn print_missing_reason(names: &Names<'_>, agent: &Agent, domain_id: u32) {
     let others = names.domains.iter().filter(|other| **other != domain_id);
     let others: Vec<String> = others.map(u32::to_string).collect();
     if names.is_empty() && !others.is_empty() {
@@ -166,22 +166,22 @@ fn explain(names: &Names<'_>, agent: &Agent, domain_id: u32) {
 
 /// Prints that announcements were missed, if any were.
 fn explain_late(names: &Names<'_>, agent: &Agent) {
-    if let Some(text) = late(names, agent.is_replay()) {
-        EXPLAINED.call_once(|| eprintln!("rp: {text}"));
+    if let Some(text) = late_start_note(names, agent.is_replay()) {
+        EXPLANATION_PRINTED.call_once(|| eprintln!("rp: {text}"));
     }
 }
 
 /// Returns a note about announcements that were made before the agent or the capture started.
 /// Endpoints are announced once, and only to other participants. Returns `None` if nothing is
 /// missing.
-fn late(names: &Names<'_>, is_replay: bool) -> Option<String> {
+fn late_start_note(names: &Names<'_>, is_replay: bool) -> Option<String> {
     let Names {
         participants,
         unknown_writers,
         remedy,
         ..
     } = names;
-    let remedy = remedy.as_deref().unwrap_or(DISCOVER);
+    let remedy = remedy.as_deref().unwrap_or(DISCOVER_COMMAND);
     let what = match (names.topics.is_empty(), unknown_writers) {
         (true, _) if *participants == 1 => {
             let what =
@@ -206,7 +206,7 @@ fn late(names: &Names<'_>, is_replay: bool) -> Option<String> {
 }
 
 /// Prints the names of one type, or their number with `count`. `found` returns the text.
-pub(crate) fn print_found(
+pub(crate) fn print_names(
     graph: &Graph,
     count: bool,
     found: impl Fn(&Names<'_>, bool) -> String,

@@ -22,7 +22,7 @@ use super::{Output, UserError};
 
 /// Maximum number of findings in a manifest, the first ones.
 const MAX_FINDINGS: usize = 1_000;
-const NANOSECONDS: u64 = 1_000_000_000;
+const NANOSECONDS_PER_SECOND: u64 = 1_000_000_000;
 
 /// `rp ship`.
 #[derive(Args, Debug)]
@@ -173,8 +173,8 @@ fn line(uploading: &Uploading) -> String {
 
 /// Returns a number of bytes with a unit.
 fn size(bytes: u64) -> String {
-    const UNITS: [(u64, &str); 3] = [(1 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB")];
-    let unit = UNITS.iter().find(|(unit, _)| bytes >= *unit);
+    const SIZE_UNITS: [(u64, &str); 3] = [(1 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB")];
+    let unit = SIZE_UNITS.iter().find(|(unit, _)| bytes >= *unit);
     match unit {
         Some((unit, name)) => format!("{:.1} {name}", bytes as f64 / *unit as f64),
         None => format!("{bytes} B"),
@@ -193,7 +193,10 @@ fn findings(socket: &SocketChoice) -> Findings {
     Arc::new(move |start, end| {
         let agent = Agent::reach(&target).ok()?;
         // A second more on both sides has the events that were reported with a delay.
-        let (from, to) = (start / NANOSECONDS, end.div_ceil(NANOSECONDS) + 1);
+        let (from, to) = (
+            start / NANOSECONDS_PER_SECOND,
+            end.div_ceil(NANOSECONDS_PER_SECOND) + 1,
+        );
         let path = format!("/history/events?from={}&to={to}", from.saturating_sub(1));
         let mut lines = agent.stream(&path).ok()?;
         let mut found = Vec::new();

@@ -46,11 +46,11 @@ pub(crate) struct Tf {
 }
 
 /// Time within which each edge should have a transform, before the last ones are used instead.
-const PATIENCE: Duration = Duration::from_secs(3);
+const POSE_TIMEOUT: Duration = Duration::from_secs(3);
 /// Consequence of sampling.
 const NOT_ALL_READ: &str = "not every transform is read";
 /// Interval at which poses are looked for within that time.
-const RETRY: Duration = Duration::from_millis(100);
+const POSE_RETRY_INTERVAL: Duration = Duration::from_millis(100);
 
 /// The moving transforms since the start of the command.
 struct Recent<'a> {
@@ -77,7 +77,7 @@ impl<'a> Recent<'a> {
 
     /// Returns whether missing transforms may still arrive.
     fn is_expected(&self) -> bool {
-        self.samples.is_some() && self.start.elapsed() < PATIENCE
+        self.samples.is_some() && self.start.elapsed() < POSE_TIMEOUT
     }
 
     /// Reads transforms for this time.
@@ -118,7 +118,7 @@ fn rate(text: &str) -> Result<f64, UnsupportedRate> {
 }
 
 impl Tf {
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         let domain_id = self.target.domain()?;
         let path = format!("/transforms?domain_id={domain_id}");
         let agent = Agent::reach(&self.target)?;
@@ -146,14 +146,14 @@ impl Tf {
         if answer.trees.is_empty() {
             names_of(&agent, domain_id)?;
         }
-        let topic = topic_of(self.only(&answer)?);
+        let topic = topic_of(self.only_tree(&answer)?);
         let mut recent = Recent::open((!is_replay).then_some(&agent), domain_id, &topic);
         let mut answer = answer;
         loop {
-            let tree = self.only(&answer)?;
+            let tree = self.only_tree(&answer)?;
             recent.history.add_last(tree);
             let explained = |error: NoTransform| {
-                let note = unread(tree).unwrap_or_default();
+                let note = unread_static_note(tree).unwrap_or_default();
                 UserError(format!("{error}{note}"))
             };
             let frames = Frames::new(tree);
@@ -166,7 +166,7 @@ impl Tf {
                 }
                 recent.follow(Duration::from_secs_f64(1.0 / self.rate))?;
             } else {
-                recent.follow(RETRY)?;
+                recent.follow(POSE_RETRY_INTERVAL)?;
             }
             answer = agent.get(&path)?;
         }
@@ -188,7 +188,7 @@ impl Tf {
                 output.write(&format!("{}/tf:\n", visible(&tree.namespace)))?;
             }
             output.write(&frames.tree(answer.timestamp_seconds))?;
-            if let Some(note) = unread(tree) {
+            if let Some(note) = unread_static_note(tree) {
                 eprintln!("rp: {}", note.trim_start_matches("; "));
             }
         }
@@ -209,7 +209,7 @@ impl Tf {
     }
 
     /// Returns the only tree that is selected.
-    fn only<'a>(&self, answer: &'a Transforms<'a>) -> Result<&'a TransformTree<'a>> {
+    fn only_tree<'a>(&self, answer: &'a Transforms<'a>) -> Result<&'a TransformTree<'a>> {
         let trees: Vec<_> = self.trees(answer).collect();
         match trees[..] {
             [tree] => Ok(tree),
@@ -235,7 +235,7 @@ fn topic_of(tree: &TransformTree<'_>) -> String {
 }
 
 /// Returns a note if static transforms are missing because the agent came later.
-fn unread(tree: &TransformTree<'_>) -> Option<String> {
+fn unread_static_note(tree: &TransformTree<'_>) -> Option<String> {
     let count = tree.unread_static_publishers;
     let publishers = if count == 1 {
         "publisher"

@@ -66,7 +66,7 @@ pub(crate) struct Top {
 }
 
 impl Top {
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         let options = Options {
             domain_id: self.target.domain_id,
             sort: self.sort,

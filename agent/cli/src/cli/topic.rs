@@ -10,9 +10,9 @@ use ros2probe::ros2::topic;
 use ros2probe_api::names::{Names, TopicName};
 
 use super::echo::Echo;
-use super::interrupt::INTERRUPTED;
+use super::interrupt::EXIT_INTERRUPTED;
 use super::rates::{Bandwidth, Delay, Hz};
-use super::shared::{Graph, Spinning, answer, print_found, print_or_fail, print_text};
+use super::shared::{Graph, Spinning, answer, print_names, print_or_fail, print_text};
 
 /// `rp topic VERB`.
 #[derive(Args, Debug)]
@@ -109,11 +109,11 @@ impl Topic {
         match &self.verb {
             Some(Verb::Hz(hz)) => hz.interrupted(),
             Some(Verb::Bw(bandwidth)) => bandwidth.interrupted(),
-            _ => INTERRUPTED,
+            _ => EXIT_INTERRUPTED,
         }
     }
 
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         let hidden = self.include_hidden_topics;
         match self.verb {
             None => super::help(&["topic"]),
@@ -121,10 +121,10 @@ impl Topic {
             Some(Verb::Info(info)) => info.ask(),
             Some(Verb::Type(kind)) => kind.ask(hidden),
             Some(Verb::Find(find)) => find.ask(hidden),
-            Some(Verb::Echo(echo)) => echo.ask(),
-            Some(Verb::Hz(hz)) => hz.ask(hidden),
-            Some(Verb::Bw(bandwidth)) => bandwidth.ask(hidden),
-            Some(Verb::Delay(delay)) => delay.ask(hidden),
+            Some(Verb::Echo(echo)) => echo.run(),
+            Some(Verb::Hz(hz)) => hz.run(hidden),
+            Some(Verb::Bw(bandwidth)) => bandwidth.run(hidden),
+            Some(Verb::Delay(delay)) => delay.run(hidden),
         }
     }
 }
@@ -165,7 +165,7 @@ impl Find {
         let found = |names: &Names<'_>, count| {
             topic::find(&self.topic_type, shown(names, hidden).map(typed), count)
         };
-        print_found(&graph, self.count_topics, found)
+        print_names(&graph, self.count_topics, found)
     }
 }
 

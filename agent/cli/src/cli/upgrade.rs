@@ -12,7 +12,7 @@ use ros2probe_daemon::config::Config;
 use super::{Output, UserError};
 
 /// Exit code if there is a newer version, as that of `dnf check-update`.
-const NEWER: u8 = 100;
+const EXIT_NEWER: u8 = 100;
 
 /// `rp upgrade`.
 #[derive(Args, Debug)]
@@ -59,7 +59,7 @@ impl Upgrade {
         };
         Output::new().write(&text)?;
         Ok(match comparison.is_newer() {
-            true => ExitCode::from(NEWER),
+            true => ExitCode::from(EXIT_NEWER),
             false => ExitCode::SUCCESS,
         })
     }

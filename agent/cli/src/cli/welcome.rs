@@ -11,7 +11,7 @@ use ros2probe_daemon::escape::visible;
 use super::{Output, help};
 
 /// Places of the unit of the service.
-const UNITS: [&str; 3] = [
+const UNIT_PATHS: [&str; 3] = [
     "/etc/systemd/system/ros2probe.service",
     "/usr/lib/systemd/system/ros2probe.service",
     "/lib/systemd/system/ros2probe.service",
@@ -52,7 +52,7 @@ impl State {
                 source: health.source.into_owned(),
                 watches: health.watches,
             },
-            Err(ClientError::NoAgent) if UNITS.iter().any(|unit| Path::new(unit).exists()) => {
+            Err(ClientError::NoAgent) if UNIT_PATHS.iter().any(|unit| Path::new(unit).exists()) => {
                 Self::Stopped
             }
             Err(ClientError::NoAgent) => Self::Absent,

@@ -16,7 +16,7 @@ use super::UserError;
 use super::shared::print_text;
 
 /// Interval of questions while no late call is known.
-const EVERY: Duration = Duration::from_secs(1);
+const POLL_INTERVAL: Duration = Duration::from_secs(1);
 
 /// `rp why`.
 #[derive(Args, Debug)]
@@ -64,7 +64,7 @@ pub(crate) struct Why {
 }
 
 impl Why {
-    pub(crate) fn ask(self) -> Result<ExitCode> {
+    pub(crate) fn run(self) -> Result<ExitCode> {
         let agent = Agent::reach(&self.target)?;
         let path = self.path()?;
         let end = Instant::now() + Duration::from_secs(self.wait);
@@ -82,13 +82,13 @@ impl Why {
                 let seconds = end.saturating_duration_since(now).as_secs();
                 eprintln!("no late call so far: waiting for at most {seconds} s (Ctrl-C ends)");
             }
-            std::thread::sleep(EVERY);
+            std::thread::sleep(POLL_INTERVAL);
         };
         if self.json {
             return print_text(&(serde_json::to_string_pretty(&answer)? + "\n"));
         }
         if why::is_empty(&answer) {
-            return Err(UserError(self.nothing(&answer)).into());
+            return Err(UserError(self.no_late_calls(&answer)).into());
         }
         print_text(&why::text(&answer, &TimeZone::system()))
     }
@@ -115,7 +115,7 @@ impl Why {
         })
     }
 
-    fn nothing(&self, answer: &Answer<'_>) -> String {
+    fn no_late_calls(&self, answer: &Answer<'_>) -> String {
         if answer.observed == "off" {
             let reason = answer.reason.as_deref();
             let reason = reason.unwrap_or("capture.inside or capture.late is off");

@@ -24,7 +24,7 @@ pub enum ClientError {
         path: PathBuf,
     },
     /// No agent listens at the given address.
-    #[error("no agent answers at {place}: {}", because(source))]
+    #[error("no agent answers at {place}: {}", io_error_text(source))]
     Unreachable {
         /// Socket path, or host and port.
         place: String,
@@ -33,13 +33,13 @@ pub enum ClientError {
     },
     /// The agent accepted the connection and sent no answer in time.
     #[error("the agent at {place} does not answer")]
-    Slow {
+    TimedOut {
         /// Socket path, or host and port.
         place: String,
     },
     /// The connection broke within an answer.
     #[error("the connection to the agent at {place} was lost")]
-    Broke {
+    Broken {
         /// Socket path, or host and port.
         place: String,
         /// Error of the connection.
@@ -62,7 +62,7 @@ pub enum ClientError {
     },
     /// The agent does not have the requested path.
     #[error("the agent at {place} is older than this rp and has no {path}")]
-    Older {
+    OlderAgent {
         /// Socket path, or host and port.
         place: String,
         /// Path without its query.
@@ -91,7 +91,7 @@ pub enum ClientError {
         path: String,
     },
     /// The token file cannot be read.
-    #[error("cannot read the token in {}: {}", path.display(), because(source))]
+    #[error("cannot read the token in {}: {}", path.display(), io_error_text(source))]
     Token {
         /// Path of the token file.
         path: PathBuf,
@@ -156,7 +156,7 @@ impl ClientError {
 }
 
 /// Returns the text of an I/O error without the error number of the operating system.
-fn because(error: &io::Error) -> String {
+fn io_error_text(error: &io::Error) -> String {
     let text = error.to_string();
     let end = text.find(" (os error").unwrap_or(text.len());
     let text = text.get(..end).unwrap_or(&text);
@@ -198,7 +198,10 @@ mod tests {
     #[test]
     fn a_reason_omits_the_error_number_of_the_system() {
         let refused = io::Error::from_raw_os_error(111);
-        assert_eq!(because(&refused), "connection refused");
-        assert_eq!(because(&io::Error::other("Name unknown")), "name unknown");
+        assert_eq!(io_error_text(&refused), "connection refused");
+        assert_eq!(
+            io_error_text(&io::Error::other("Name unknown")),
+            "name unknown"
+        );
     }
 }

@@ -10,7 +10,7 @@ use tokio::time::timeout;
 use super::{Agent, ClientError};
 
 /// Time to read data that has already arrived, after the limit on silence has passed.
-const GRACE: Duration = Duration::from_millis(500);
+const DRAIN_TIMEOUT: Duration = Duration::from_millis(500);
 /// Maximum length of a line, in bytes. A graph of 8192 endpoints has 2 MB.
 const MAX_LINE: usize = 8 << 20;
 
@@ -105,7 +105,7 @@ impl<'a> Lines<'a> {
                     return Err(self
                         .agent
                         .transport
-                        .broke("the stream ended within a message"));
+                        .broken_connection("the stream ended within a message"));
                 }
             }
             self.searched = 0;
@@ -147,7 +147,7 @@ impl<'a> Lines<'a> {
                         return Ok(true);
                     }
                 }
-                Some(Err(error)) => return Err(self.agent.transport.broke(error)),
+                Some(Err(error)) => return Err(self.agent.transport.broken_connection(error)),
             }
         }
         Ok(false)
@@ -163,9 +163,9 @@ impl<'a> Lines<'a> {
         if frame.is_err() {
             // This process may have been stopped for a while, so data that has arrived is read
             // first.
-            frame = timeout(GRACE, self.body.frame()).await;
+            frame = timeout(DRAIN_TIMEOUT, self.body.frame()).await;
         }
         self.waited = Duration::ZERO;
-        frame.map_err(|_| self.agent.transport.slow())
+        frame.map_err(|_| self.agent.transport.timed_out())
     }
 }

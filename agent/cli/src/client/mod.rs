@@ -48,9 +48,9 @@ use transport::Transport;
 const TIMEOUT: Duration = Duration::from_secs(30);
 /// Maximum silence of an agent: before its answer, within it, and in a stream of messages, which
 /// contains the clock.
-const SILENCE: Duration = Duration::from_secs(5);
+const STREAM_SILENCE: Duration = Duration::from_secs(5);
 /// Maximum silence in a stream of events, which has a heartbeat every 15 s.
-const BEATS: Duration = Duration::from_secs(40);
+const HEARTBEAT_TIMEOUT: Duration = Duration::from_secs(40);
 /// Maximum size of an answer, in bytes. Streams have no such limit.
 const MAX_ANSWER: usize = 256 << 20;
 
@@ -151,7 +151,7 @@ impl Agent {
     pub fn get_visible<T: DeserializeOwned>(&self, path: &str) -> Result<T, ClientError> {
         let answer = self.get(path)?;
         serde_json::from_value(visible_text(answer))
-            .map_err(|source| self.transport.unreadable(path, source))
+            .map_err(|source| self.transport.unreadable_answer(path, source))
     }
 
     /// Requests `path` like [`Self::get`], and waits for the answer for at most `longest`.
@@ -201,7 +201,7 @@ impl Agent {
     pub fn delete(&self, path: &str) -> Result<(), ClientError> {
         self.runtime.block_on(async {
             let answer = self.send(Method::DELETE, path, None).await?;
-            self.whole(path, answer).await.map(drop)
+            self.read_body(path, answer).await.map(drop)
         })
     }
 
@@ -217,15 +217,15 @@ impl Agent {
             if answer.status().is_success() {
                 self.transport.resume();
                 let silence = if path.starts_with("/events") {
-                    BEATS
+                    HEARTBEAT_TIMEOUT
                 } else {
-                    SILENCE
+                    STREAM_SILENCE
                 };
                 // A replay within this process runs at the pace of its capture.
                 let silence = (!self.transport.is_replayed()).then_some(silence);
                 Ok(Lines::new(self, answer.into_body(), silence))
             } else {
-                let refused = self.whole(path, answer).await;
+                let refused = self.read_body(path, answer).await;
                 Err(refused
                     .err()
                     .unwrap_or_else(|| self.transport.not_an_agent()))
@@ -235,13 +235,14 @@ impl Agent {
 
     /// Decodes the JSON of a line or an answer.
     fn decoded<T: DeserializeOwned>(&self, path: &str, text: &[u8]) -> Result<T, ClientError> {
-        serde_json::from_slice(text).map_err(|source| self.transport.unreadable(path, source))
+        serde_json::from_slice(text)
+            .map_err(|source| self.transport.unreadable_answer(path, source))
     }
 
     /// Returns the error of a connection that closed before the answer.
-    fn hung_up(&self, path: &str) -> ClientError {
+    fn connection_closed(&self, path: &str) -> ClientError {
         self.transport
-            .broke(format!("{path} ended before its first byte"))
+            .broken_connection(format!("{path} ended before its first byte"))
     }
 
     /// Returns whether the agent replays a capture within this process.
@@ -272,10 +273,10 @@ impl Agent {
         let answer = self.runtime.block_on(async {
             let exchange = async {
                 let answer = self.send(method, path, body).await?;
-                self.whole(path, answer).await
+                self.read_body(path, answer).await
             };
             let answer = timeout(longest, exchange).await;
-            answer.unwrap_or_else(|_| Err(self.transport.slow()))
+            answer.unwrap_or_else(|_| Err(self.transport.timed_out()))
         })?;
         self.decoded(path, &answer)
     }
@@ -304,21 +305,25 @@ impl Agent {
         if self.transport.is_replayed() {
             return self.transport.send(request).await;
         }
-        let answer = timeout(SILENCE, self.transport.send(request)).await;
-        answer.unwrap_or_else(|_| Err(self.transport.slow()))
+        let answer = timeout(STREAM_SILENCE, self.transport.send(request)).await;
+        answer.unwrap_or_else(|_| Err(self.transport.timed_out()))
     }
 
     /// Reads the whole body of a successful answer; problem details become an error.
-    async fn whole(&self, path: &str, answer: Response<Incoming>) -> Result<Bytes, ClientError> {
+    async fn read_body(
+        &self,
+        path: &str,
+        answer: Response<Incoming>,
+    ) -> Result<Bytes, ClientError> {
         let status = answer.status();
         let mut body = Limited::new(answer.into_body(), MAX_ANSWER);
         let mut whole = BytesMut::new();
         loop {
-            let frame = timeout(SILENCE, body.frame()).await;
-            let Some(frame) = frame.map_err(|_| self.transport.slow())? else {
+            let frame = timeout(STREAM_SILENCE, body.frame()).await;
+            let Some(frame) = frame.map_err(|_| self.transport.timed_out())? else {
                 break;
             };
-            let frame = frame.map_err(|source| self.transport.broke(source))?;
+            let frame = frame.map_err(|source| self.transport.broken_connection(source))?;
             whole.extend_from_slice(&frame.into_data().unwrap_or_default());
         }
         let body = whole.freeze();
@@ -330,7 +335,7 @@ impl Agent {
         };
         Err(match (status, refusal.code.as_str()) {
             (StatusCode::UNAUTHORIZED, _) => self.transport.unauthorized(self.token.is_some()),
-            (_, code) if code == Code::NotFound.as_str() => self.transport.older(path),
+            (_, code) if code == Code::NotFound.as_str() => self.transport.older_agent(path),
             _ => ClientError::Refused(refusal),
         })
     }

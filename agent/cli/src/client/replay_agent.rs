@@ -28,9 +28,9 @@ use tokio_util::sync::CancellationToken;
 /// Capacity of a pipe in bytes; most answers are smaller.
 const PIPE_BYTES: usize = 1 << 20;
 /// Cap on topics. A capture is read offline, so the limit of a live agent does not apply.
-const TOPICS: usize = 16_384;
+const MAX_TOPICS: usize = 16_384;
 /// Maximum wait for the end of a replay whose streams have ended.
-const TIMEOUT: Duration = Duration::from_millis(500);
+const END_TIMEOUT: Duration = Duration::from_millis(500);
 
 /// Range and pace of a replay.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -105,7 +105,7 @@ impl ReplayAgent {
         report: fn(&str),
     ) -> Result<Self, ReplayError> {
         let mut config = Config::default();
-        config.limits.topics = TOPICS;
+        config.limits.topics = MAX_TOPICS;
         let (replay, mut control) = open(capture, options, &config)?;
         let stop = CancellationToken::new();
         let agent = assemble(replay, options.measured, &config, stop.clone());
@@ -143,9 +143,9 @@ impl ReplayAgent {
     /// Returns the result of the replay; `None` until its end.
     #[must_use]
     pub(super) fn outcome(&self) -> Option<Outcome> {
-        let deadline = Instant::now() + TIMEOUT;
+        let deadline = Instant::now() + END_TIMEOUT;
         while self.outcome.get().is_none() && Instant::now() < deadline {
-            std::thread::sleep(TIMEOUT / 50);
+            std::thread::sleep(END_TIMEOUT / 50);
         }
         self.outcome.get().cloned()
     }
@@ -204,17 +204,17 @@ fn open(
     };
     let replay =
         Replay::open(capture, options.expansion, speed, limits).map_err(ReplayError::Capture)?;
-    let replay = replay.until(options.until);
+    let replay = replay.ending_at(options.until);
     Ok(match options.pace {
         Pace::ToEnd => (replay, None),
-        Pace::Live(_) => (replay.quiet(), None),
+        Pace::Live(_) => (replay.without_progress(), None),
         Pace::Pause => {
             let (pause, control) = pause_at(options.from);
             (replay.pausing_at(pause), Some(control))
         }
         Pace::Steps => {
             let (pause, control) = pause_at(options.from);
-            (replay.quiet().pausing_at(pause), Some(control))
+            (replay.without_progress().pausing_at(pause), Some(control))
         }
     })
 }
@@ -252,7 +252,7 @@ fn assemble(
         spans: Arc::default(),
         node_logs: Arc::default(),
         watches: Arc::new(watches.map_err(io::Error::other)?),
-        keeper: None,
+        state_writer: None,
         // `rp bag record` records a capture, not the agent that replays it.
         recordings: None,
         receipts: None,
@@ -292,7 +292,7 @@ fn spawn(
         let result = run.run();
         let unsupported = latest.state().agent.unsupported_packets.clone();
         if let Some(Report { file, print }) = report {
-            let lines = faults(&file, &result, &unsupported);
+            let lines = capture_faults(&file, &result, &unsupported);
             lines.iter().for_each(|line| print(line));
         }
         let _ = stored.set(Outcome {
@@ -307,7 +307,7 @@ fn spawn(
 }
 
 /// Returns the unreadable parts of a capture with their remedies, one per line.
-fn faults(
+fn capture_faults(
     capture: &Path,
     result: &Result<(), RunError>,
     unsupported: &[(u16, u64)],

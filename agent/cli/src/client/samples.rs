@@ -28,7 +28,7 @@ impl<'a> Samples<'a> {
         let mut lines = agent.stream(&path)?;
         let open = loop {
             match lines.line()? {
-                None => return Err(agent.hung_up(&path)),
+                None => return Err(agent.connection_closed(&path)),
                 Some(line) => {
                     if let Line::Open(open) = agent.decoded(&path, &line)? {
                         break open;

@@ -25,11 +25,11 @@ use ros2probe_daemon::run::CaptureTime;
 /// The agent's socket, as created by the package and the service manager.
 const SOCKET: &str = "/run/ros2probe/api.sock";
 /// Default address of the agent's API.
-const LOOPBACK: &str = "127.0.0.1:17401";
+const LOOPBACK_ADDRESS: &str = "127.0.0.1:17401";
 /// Default port of an agent on another host.
 const PORT: &str = "17401";
 /// Maximum wait for a connection.
-const TIMEOUT: Duration = Duration::from_secs(5);
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// A transport to an agent.
 #[derive(Debug)]
@@ -75,12 +75,12 @@ impl Transport {
             return Ok(Self::Socket(path.clone()));
         }
         let path = Path::new(SOCKET);
-        let socket = match within(UnixStream::connect(path)).await {
+        let socket = match with_connect_timeout(UnixStream::connect(path)).await {
             Ok(_) => return Ok(Self::Socket(path.to_path_buf())),
             Err(error) => error,
         };
-        match within(TcpStream::connect(LOOPBACK)).await {
-            Ok(_) => Ok(Self::Address(LOOPBACK.to_owned())),
+        match with_connect_timeout(TcpStream::connect(LOOPBACK_ADDRESS)).await {
+            Ok(_) => Ok(Self::Address(LOOPBACK_ADDRESS.to_owned())),
             Err(_) if socket.kind() == io::ErrorKind::PermissionDenied => {
                 let path = path.to_path_buf();
                 Err(ClientError::Denied { path })
@@ -104,11 +104,11 @@ impl Transport {
     ) -> Result<Response<Incoming>, ClientError> {
         match self {
             Self::Socket(path) => {
-                let stream = self.in_time(UnixStream::connect(path)).await?;
+                let stream = self.with_timeout(UnixStream::connect(path)).await?;
                 self.exchange(stream, request).await
             }
             Self::Address(address) => {
-                let stream = self.in_time(TcpStream::connect(address)).await?;
+                let stream = self.with_timeout(TcpStream::connect(address)).await?;
                 let _ = stream.set_nodelay(true);
                 self.exchange(stream, request).await
             }
@@ -145,19 +145,21 @@ impl Transport {
         }
     }
 
-    async fn in_time<S>(
+    async fn with_timeout<S>(
         &self,
         connect: impl Future<Output = io::Result<S>>,
     ) -> Result<S, ClientError> {
-        within(connect).await.map_err(|source| match self {
-            Self::Socket(path) if source.kind() == io::ErrorKind::PermissionDenied => {
-                ClientError::Denied { path: path.clone() }
-            }
-            _ => ClientError::Unreachable {
-                place: self.to_string(),
-                source,
-            },
-        })
+        with_connect_timeout(connect)
+            .await
+            .map_err(|source| match self {
+                Self::Socket(path) if source.kind() == io::ErrorKind::PermissionDenied => {
+                    ClientError::Denied { path: path.clone() }
+                }
+                _ => ClientError::Unreachable {
+                    place: self.to_string(),
+                    source,
+                },
+            })
     }
 
     async fn exchange<S>(
@@ -169,30 +171,30 @@ impl Transport {
         S: AsyncRead + AsyncWrite + Unpin + Send + 'static,
     {
         let shaken = http1::handshake(TokioIo::new(stream)).await;
-        let (mut sender, connection) = shaken.map_err(|error| self.broke(error))?;
+        let (mut sender, connection) = shaken.map_err(|error| self.broken_connection(error))?;
         tokio::spawn(connection);
         let answer = sender.send_request(request).await;
         answer.map_err(|error| {
             if error.is_parse() {
                 self.not_an_agent()
             } else {
-                self.broke(error)
+                self.broken_connection(error)
             }
         })
     }
 
-    pub(super) fn broke(
+    pub(super) fn broken_connection(
         &self,
         source: impl Into<Box<dyn std::error::Error + Send + Sync>>,
     ) -> ClientError {
-        ClientError::Broke {
+        ClientError::Broken {
             place: self.to_string(),
             source: source.into(),
         }
     }
 
-    pub(super) fn slow(&self) -> ClientError {
-        ClientError::Slow {
+    pub(super) fn timed_out(&self) -> ClientError {
+        ClientError::TimedOut {
             place: self.to_string(),
         }
     }
@@ -210,14 +212,14 @@ impl Transport {
         }
     }
 
-    pub(super) fn older(&self, path: &str) -> ClientError {
-        ClientError::Older {
+    pub(super) fn older_agent(&self, path: &str) -> ClientError {
+        ClientError::OlderAgent {
             place: self.to_string(),
             path: without_query(path),
         }
     }
 
-    pub(super) fn unreadable(&self, path: &str, source: serde_json::Error) -> ClientError {
+    pub(super) fn unreadable_answer(&self, path: &str, source: serde_json::Error) -> ClientError {
         ClientError::Unreadable {
             place: self.to_string(),
             path: without_query(path),
@@ -236,8 +238,8 @@ impl fmt::Display for Transport {
     }
 }
 
-async fn within<S>(connect: impl Future<Output = io::Result<S>>) -> io::Result<S> {
-    let connected = timeout(TIMEOUT, connect).await;
+async fn with_connect_timeout<S>(connect: impl Future<Output = io::Result<S>>) -> io::Result<S> {
+    let connected = timeout(CONNECT_TIMEOUT, connect).await;
     connected.unwrap_or_else(|_| Err(io::ErrorKind::TimedOut.into()))
 }
 

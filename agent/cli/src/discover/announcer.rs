@@ -11,7 +11,7 @@ use ros2probe_wire::discovery::Role;
 use crate::tables::ReceivedAnnouncements;
 use ros2probe_model::facts::bounded::Bounded;
 
-use super::message::{MOST_NUMBERS, PUBLICATIONS_READER, SUBSCRIPTIONS_READER};
+use super::message::{MAX_NUMBERS, PUBLICATIONS_READER, SUBSCRIPTIONS_READER};
 
 /// A writer of announcements and its state.
 #[derive(Debug)]
@@ -60,7 +60,7 @@ impl Announcer {
         let first = self.missing().next().unwrap_or_default();
         let wanted: BTreeSet<_> = self
             .missing()
-            .take_while(|number| *number - first < MOST_NUMBERS)
+            .take_while(|number| *number - first < MAX_NUMBERS)
             .collect();
         self.requested.clone_from(&wanted);
         wanted

@@ -22,20 +22,20 @@ pub const SUBSCRIPTIONS_READER: EntityId = EntityId([0x00, 0x00, 0x04, 0xc7]);
 const SPDP_READER: EntityId = EntityId([0x00, 0x01, 0x00, 0xc7]);
 
 /// Multicast address of discovery in all domains (RTPS 2.5, 9.6.2.4).
-const MULTICAST: [u8; 4] = [239, 255, 0, 1];
+const MULTICAST_ADDRESS: [u8; 4] = [239, 255, 0, 1];
 /// SPDP writer, SEDP publications reader, SEDP subscriptions writer and reader. Fast DDS accepts a
 /// goodbye only from participants with an SPDP writer.
 const BUILTIN_ENDPOINTS: u32 = 0x39;
 /// Lease of the participant, in case the goodbye is lost.
 const LEASE_SECONDS: u32 = 3;
 /// Maximum number of sequence numbers in one ACKNACK (RTPS 2.5, 9.4.2.6).
-pub const MOST_NUMBERS: u64 = 256;
+pub const MAX_NUMBERS: u64 = 256;
 
 /// No flags. The encoder adds flag E to each submessage.
-const NONE: SubmessageFlags = SubmessageFlags(0);
+const NO_FLAGS: SubmessageFlags = SubmessageFlags(0);
 const PL_CDR_LE: [u8; 4] = [0x00, 0x03, 0x00, 0x00];
 /// Disposed and unregistered; STATUS_INFO is always big-endian (RTPS 2.5, 9.6.4.9).
-const GONE: [u8; 4] = [0, 0, 0, 3];
+const DISPOSED_UNREGISTERED: [u8; 4] = [0, 0, 0, 3];
 
 /// The participant of this process.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -57,7 +57,7 @@ impl Message {
     #[must_use]
     pub fn new(local: LocalParticipant, target: GuidPrefix) -> Self {
         let header = [&b"RTPS\x02\x03"[..], &VENDOR.0, &local.prefix.0];
-        Self(header.concat()).submessage(SubmessageId::INFO_DST, NONE, &[&target.0])
+        Self(header.concat()).submessage(SubmessageId::INFO_DST, NO_FLAGS, &[&target.0])
     }
 
     /// Adds the SPDP announcement.
@@ -72,7 +72,7 @@ impl Message {
         // No ports exist beyond domain 232.
         let port = local.domain_id.saturating_mul(DomainId::PORT_GAIN);
         let port = port.saturating_add(DomainId::PORT_BASE);
-        let multicast = locator(MULTICAST.into(), port);
+        let multicast = locator(MULTICAST_ADDRESS.into(), port);
         let payload = Parameters::default()
             .add(ParameterId::PROTOCOL_VERSION, &[2, 3, 0, 0])
             .add(ParameterId::VENDORID, &[VENDOR.0[0], VENDOR.0[1], 0, 0])
@@ -98,7 +98,7 @@ impl Message {
         let own = Guid::new(local.prefix, EntityId::PARTICIPANT);
         let inline_qos = Parameters::default()
             .add(ParameterId::KEY_HASH, &own.to_bytes())
-            .add(ParameterId::STATUS_INFO, &GONE)
+            .add(ParameterId::STATUS_INFO, &DISPOSED_UNREGISTERED)
             .end();
         let head = data_head(SPDP_READER, EntityId::SPDP_WRITER, 2);
         self.submessage(
@@ -141,7 +141,7 @@ impl Message {
     }
 
     /// Adds an ACKNACK: all samples of this writer before `base` are received, and these numbers
-    /// are missing. Numbers beyond [`MOST_NUMBERS`] from `base` are left out.
+    /// are missing. Numbers beyond [`MAX_NUMBERS`] from `base` are left out.
     #[must_use]
     pub fn acknack(
         self,
@@ -181,7 +181,7 @@ impl Message {
             &set,
             &count,
         ];
-        self.submessage(SubmessageId::NACK_FRAG, NONE, &body)
+        self.submessage(SubmessageId::NACK_FRAG, NO_FLAGS, &body)
     }
 
     /// Returns the bytes of the message.

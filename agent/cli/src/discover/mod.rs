@@ -26,11 +26,11 @@ use self::session::{Outgoing, Session, Target};
 use ros2probe_model::report::snapshot::ParticipantFacts;
 
 /// Interval at which the session advances without input.
-const SLICE: Duration = Duration::from_millis(5);
+const ADVANCE_INTERVAL: Duration = Duration::from_millis(5);
 /// Wait after the goodbye for packets in flight, which a closed port would make the kernel answer.
-const LINGER: Duration = Duration::from_millis(50);
+const LINGER_TIME: Duration = Duration::from_millis(50);
 /// Maximum size of a UDP payload, in bytes.
-const DATAGRAM: usize = 65_507;
+const MAX_DATAGRAM: usize = 65_507;
 
 /// Reason why a participant receives no request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -40,9 +40,9 @@ pub enum Refusal {
     /// The participant announces no IPv4 address for discovery.
     NoAddress,
     /// The participant announces its endpoints by TCP.
-    ByTcp,
+    UsesTcp,
     /// The participant is another running `rp discover`.
-    Asking,
+    OtherDiscover,
 }
 
 /// A request failed.
@@ -61,7 +61,7 @@ pub enum DiscoverError {
     Random(#[source] io::Error),
     /// A packet cannot be sent or received.
     #[error("cannot exchange packets with {target}")]
-    Talk {
+    Socket {
         /// Address of the participant.
         target: SocketAddrV4,
         /// Error of the operating system.
@@ -80,10 +80,10 @@ impl Target {
             return Err(Refusal::Secured);
         }
         if participant.guid.prefix.0.starts_with(&VENDOR.0) {
-            return Err(Refusal::Asking);
+            return Err(Refusal::OtherDiscover);
         }
         if participant.announces_by_tcp {
-            return Err(Refusal::ByTcp);
+            return Err(Refusal::UsesTcp);
         }
         let addresses = &participant.addresses;
         let metatraffic = reachable(&addresses.metatraffic).ok_or(Refusal::NoAddress)?;
@@ -108,8 +108,8 @@ impl Refusal {
         match self {
             Self::Secured => "uses DDS security: receives no requests",
             Self::NoAddress => "announces no IPv4 address for discovery",
-            Self::ByTcp => "announces by TCP: another participant with TCP makes it repeat that",
-            Self::Asking => "is another rp discover",
+            Self::UsesTcp => "announces by TCP: another participant with TCP makes it repeat that",
+            Self::OtherDiscover => "is another rp discover",
         }
     }
 }
@@ -125,11 +125,11 @@ pub fn local_participant(
     domain_id: u32,
 ) -> Result<(LocalParticipant, UdpSocket), DiscoverError> {
     let open = || {
-        let address = leaving(target.metatraffic)?;
+        let address = local_address(target.metatraffic)?;
         // Fast DDS answers a participant of its own host at 127.0.0.1, whatever address is
         // announced.
         let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0))?;
-        socket.set_read_timeout(Some(SLICE))?;
+        socket.set_read_timeout(Some(ADVANCE_INTERVAL))?;
         let port = socket.local_addr()?.port();
         Ok((SocketAddrV4::new(address, port), socket))
     };
@@ -157,14 +157,14 @@ pub fn local_participant(
 /// # Errors
 ///
 /// Fails if the network fails. A goodbye is attempted nevertheless.
-pub fn converse(session: &mut Session, socket: &UdpSocket) -> Result<Duration, DiscoverError> {
+pub fn run_session(session: &mut Session, socket: &UdpSocket) -> Result<Duration, DiscoverError> {
     let began = Instant::now();
     // The session's time begins at 1, since 0 precedes all events.
     let now = || {
         let elapsed = u64::try_from(began.elapsed().as_nanos()).unwrap_or(u64::MAX);
         Timestamp(elapsed.saturating_add(1))
     };
-    let mut buffer = vec![0; DATAGRAM];
+    let mut buffer = vec![0; MAX_DATAGRAM];
     while !session.is_over() {
         let outgoing = session.advance(now());
         let round =
@@ -175,7 +175,7 @@ pub fn converse(session: &mut Session, socket: &UdpSocket) -> Result<Duration, D
         }
     }
     let took = began.elapsed();
-    let end = Instant::now() + LINGER;
+    let end = Instant::now() + LINGER_TIME;
     while Instant::now() < end {
         listen(session, socket, &mut buffer, now)?;
     }
@@ -193,16 +193,16 @@ fn listen(
         Ok((length, _)) => session.datagram(now(), buffer.get(..length).unwrap_or_default()),
         // A connection was refused because an earlier packet reached a closed port. The session
         // handles the silence.
-        Err(error) if is_passing(&error) => {}
+        Err(error) if is_transient(&error) => {}
         Err(source) => {
             let target = session.target().metatraffic;
-            return Err(DiscoverError::Talk { target, source });
+            return Err(DiscoverError::Socket { target, source });
         }
     }
     Ok(())
 }
 
-fn is_passing(error: &io::Error) -> bool {
+fn is_transient(error: &io::Error) -> bool {
     use io::ErrorKind::{ConnectionRefused, Interrupted, TimedOut, WouldBlock};
     matches!(
         error.kind(),
@@ -213,7 +213,7 @@ fn is_passing(error: &io::Error) -> bool {
 fn send(socket: &UdpSocket, outgoing: &[Outgoing]) -> Result<(), DiscoverError> {
     for Outgoing { to, bytes, .. } in outgoing {
         let sent = socket.send_to(bytes, to);
-        sent.map_err(|source| DiscoverError::Talk {
+        sent.map_err(|source| DiscoverError::Socket {
             target: *to,
             source,
         })?;
@@ -236,11 +236,11 @@ fn reachable(addresses: &[SocketAddr]) -> Option<SocketAddrV4> {
     candidates.sort_by_key(|address| address.ip().is_loopback());
     candidates
         .into_iter()
-        .find(|address| leaving(*address).is_ok())
+        .find(|address| local_address(*address).is_ok())
 }
 
 /// Returns the local address of packets to the target. Connecting a UDP socket sends nothing.
-fn leaving(target: SocketAddrV4) -> io::Result<Ipv4Addr> {
+fn local_address(target: SocketAddrV4) -> io::Result<Ipv4Addr> {
     let probe = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0))?;
     probe.connect(target)?;
     match probe.local_addr()?.ip() {

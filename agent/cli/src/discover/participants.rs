@@ -34,7 +34,7 @@ pub struct Listening {
 
 /// A participant that announced itself.
 #[derive(Clone, Debug)]
-pub struct HeardParticipant {
+pub struct FoundParticipant {
     /// The participant's GUID prefix.
     pub prefix: GuidPrefix,
     /// Domain of the participant.
@@ -57,11 +57,11 @@ pub struct HeardParticipant {
 ///
 /// Returns [`privilege::Missing`] if a capability is missing, or the error of a source that cannot
 /// be opened or read.
-pub fn listen(configured: CaptureSettings, listening: &Listening) -> Result<Vec<HeardParticipant>> {
+pub fn listen(configured: CaptureSettings, listening: &Listening) -> Result<Vec<FoundParticipant>> {
     let capture = capture(configured, listening.interface.as_deref());
     privilege::check(&capture)?;
     let mut live = LiveSource::open(&capture, Limits::default())?;
-    privilege::give_up(privilege::Role::capture())?;
+    privilege::drop_capabilities(privilege::Role::capture())?;
     let mut observer = Observer::new(Settings::default());
     let end = Instant::now() + listening.time;
     let is_meant = |participant: &ParticipantFacts| {
@@ -74,11 +74,11 @@ pub fn listen(configured: CaptureSettings, listening: &Listening) -> Result<Vec<
         live.poll(left.min(POLL_INTERVAL), None, &mut observer)?;
         observer.input(Input::Time(live.clock()));
         live.apply(&observer.drain().interest);
-        let mut heard = observer.snapshot(live.clock()).participants;
-        heard.retain(is_meant);
-        let is_found = listening.participant.is_some() && !heard.is_empty();
+        let mut found = observer.snapshot(live.clock()).participants;
+        found.retain(is_meant);
+        let is_found = listening.participant.is_some() && !found.is_empty();
         if left.is_zero() || is_found {
-            return Ok(heard.iter().map(HeardParticipant::of).collect());
+            return Ok(found.iter().map(FoundParticipant::of).collect());
         }
     }
 }
@@ -91,7 +91,7 @@ pub fn prefix(text: &str) -> Option<GuidPrefix> {
     hexadecimal(text).map(GuidPrefix)
 }
 
-impl HeardParticipant {
+impl FoundParticipant {
     fn of(facts: &ParticipantFacts) -> Self {
         let ProcessFacts { name, id, host, .. } = &facts.process;
         Self {

@@ -1,7 +1,7 @@
 //! One conversation with one participant: announcement, requests, goodbye.
 //!
 //! A state machine without socket and clock: time and datagrams in, datagrams out. It sends at most
-//! [`MOST_PACKETS`] packets whatever the participant does, and the last one is the goodbye.
+//! [`MAX_PACKETS`] packets whatever the participant does, and the last one is the goodbye.
 //! HEARTBEATs are not answered individually: Fast DDS sends several while it repeats its
 //! announcements, and restarts after each answer.
 
@@ -18,8 +18,7 @@ use ros2probe_wire::{EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
 
 use super::announcer::Announcer;
 use super::message::{
-    LocalParticipant, MOST_NUMBERS, Message, NODES_READER, PUBLICATIONS_READER,
-    SUBSCRIPTIONS_READER,
+    LocalParticipant, MAX_NUMBERS, Message, NODES_READER, PUBLICATIONS_READER, SUBSCRIPTIONS_READER,
 };
 use crate::tables::{DiscoveredEndpoints, PartialAnnouncements, UserWriters};
 use ros2probe_model::facts::bounded::Bounded;
@@ -28,19 +27,19 @@ use ros2probe_model::facts::wall_clock::WallClock;
 use ros2probe_model::graph::discovery_fragments::DiscoveryFragments;
 
 /// Maximum number of packets sent to one participant, including the goodbye.
-pub const MOST_PACKETS: u32 = 6;
+pub const MAX_PACKETS: u32 = 6;
 
 /// Silence after which the announcement is repeated once. Both vendors announce
 /// themselves within 2 ms.
-const SILENCE: Duration = Duration::from_millis(500);
+const END_SILENCE: Duration = Duration::from_millis(500);
 /// Time from the first HEARTBEAT to the request, so that the second one can arrive.
-const GATHER: Duration = Duration::from_millis(20);
+const REQUEST_DELAY: Duration = Duration::from_millis(20);
 /// Maximum wait for requested samples before another request.
-const TIMEOUT: Duration = Duration::from_millis(300);
+const REQUEST_TIMEOUT: Duration = Duration::from_millis(300);
 /// Maximum wait for the node list after everything else.
 const NODES_TIMEOUT: Duration = Duration::from_millis(500);
 /// Maximum duration of a conversation.
-const LIMIT: Duration = Duration::from_secs(3);
+const MAX_DURATION: Duration = Duration::from_secs(3);
 const NODES_TOPIC: &str = "ros_discovery_info";
 
 /// Participant that receives requests, and its addresses.
@@ -85,9 +84,9 @@ pub struct Session {
     publications: Announcer,
     subscriptions: Announcer,
     /// Time of the first HEARTBEAT of either writer.
-    heard: Option<Timestamp>,
+    first_heartbeat: Option<Timestamp>,
     /// Time of the last request, and number of requests.
-    asked: Option<Timestamp>,
+    last_request: Option<Timestamp>,
     requests: u32,
     discovery_fragments: DiscoveryFragments,
     /// Incomplete samples, each with the time of its last fragment.
@@ -98,7 +97,7 @@ pub struct Session {
     nodes: Nodes,
     sent: Traffic,
     received: Traffic,
-    over: bool,
+    is_finished: bool,
 }
 
 #[derive(Debug)]
@@ -125,8 +124,8 @@ impl Session {
             announced: Timestamp(0),
             publications: Announcer::of(Role::Writer),
             subscriptions: Announcer::of(Role::Reader),
-            heard: None,
-            asked: None,
+            first_heartbeat: None,
+            last_request: None,
             requests: 0,
             discovery_fragments: DiscoveryFragments::default(),
             partial: Bounded::default(),
@@ -135,7 +134,7 @@ impl Session {
             nodes: Nodes::Open { since: None },
             sent: Traffic::default(),
             received: Traffic::default(),
-            over: false,
+            is_finished: false,
         }
     }
 
@@ -143,7 +142,7 @@ impl Session {
     #[must_use]
     pub fn plan(&self) -> Vec<Outgoing> {
         let first = SequenceNumber::FIRST;
-        let full = || (first, first.until(first + MOST_NUMBERS));
+        let full = || (first, first.until(first + MAX_NUMBERS));
         let mut plan = vec![
             self.to_discovery("introduction", self.message().announce(self.local)),
             self.to_discovery("request", self.request([full(), full()])),
@@ -176,17 +175,17 @@ impl Session {
     /// Advances the time. Returns the datagrams to send now.
     pub fn advance(&mut self, now: Timestamp) -> Vec<Outgoing> {
         let mut outgoing = Vec::new();
-        if self.over {
+        if self.is_finished {
             return outgoing;
         }
         if self.sent.packets == 0 {
             self.began = now;
             self.introduce(now, &mut outgoing);
         }
-        let is_deaf = self.heard.is_none() && now - self.announced >= SILENCE;
+        let is_deaf = self.first_heartbeat.is_none() && now - self.announced >= END_SILENCE;
         if is_deaf && self.sent.packets == 1 {
             self.introduce(now, &mut outgoing);
-        } else if is_deaf || now - self.began >= LIMIT {
+        } else if is_deaf || now - self.began >= MAX_DURATION {
             self.end(&mut outgoing);
             return outgoing;
         }
@@ -202,7 +201,7 @@ impl Session {
     /// Returns the goodbye, if it has not been sent.
     pub fn say_goodbye(&mut self) -> Vec<Outgoing> {
         let mut outgoing = Vec::new();
-        if !self.over && self.sent.packets > 0 {
+        if !self.is_finished && self.sent.packets > 0 {
             self.end(&mut outgoing);
         }
         outgoing
@@ -217,13 +216,13 @@ impl Session {
     /// Returns whether the session has ended.
     #[must_use]
     pub const fn is_over(&self) -> bool {
-        self.over
+        self.is_finished
     }
 
     /// Returns whether the participant sent a HEARTBEAT of a writer of SEDP.
     #[must_use]
     pub const fn was_answered(&self) -> bool {
-        self.heard.is_some()
+        self.first_heartbeat.is_some()
     }
 
     /// Returns the number of available announcements that did not arrive.
@@ -272,7 +271,7 @@ impl Session {
                 let range = heartbeat.first..=heartbeat.last;
                 if let Some(announcer) = announcer {
                     announcer.available = Some(range);
-                    self.heard.get_or_insert(now);
+                    self.first_heartbeat.get_or_insert(now);
                 } else if !entity.is_builtin() {
                     self.user_writers.insert(entity, range);
                 }
@@ -384,18 +383,20 @@ impl Session {
     /// Requests announcements after both writers have sent a HEARTBEAT. Repeats the request for
     /// further samples, or after a timeout.
     fn request_announcements(&mut self, now: Timestamp, outgoing: &mut Vec<Outgoing>) {
-        let Some(heard) = self.heard else { return };
+        let Some(first_heartbeat_at) = self.first_heartbeat else {
+            return;
+        };
         let both = self.publications.available.is_some() && self.subscriptions.available.is_some();
-        let due = match self.asked {
-            None => both || now - heard >= GATHER,
+        let due = match self.last_request {
+            None => both || now - first_heartbeat_at >= REQUEST_DELAY,
             Some(asked) => {
                 let came = self.publications.is_answered() && self.subscriptions.is_answered();
-                came || now - asked >= TIMEOUT
+                came || now - asked >= REQUEST_TIMEOUT
             }
         };
         // One of the remaining packets is for the node request and one for the goodbye.
         let reserved = 1 + u32::from(self.wants_nodes && matches!(self.nodes, Nodes::Open { .. }));
-        if !due || self.missing() == 0 || self.sent.packets + reserved >= MOST_PACKETS {
+        if !due || self.missing() == 0 || self.sent.packets + reserved >= MAX_PACKETS {
             return;
         }
         let wanted = [&mut self.publications, &mut self.subscriptions].map(Announcer::next_request);
@@ -404,7 +405,7 @@ impl Session {
             let base = wanted.first().copied().unwrap_or_default();
             (base, wanted)
         }));
-        self.asked = Some(now);
+        self.last_request = Some(now);
         self.send(self.to_discovery("request", message), outgoing);
     }
 
@@ -419,7 +420,7 @@ impl Session {
         let Some(last) = self.user_writers.get(&writer).map(|range| *range.end()) else {
             return;
         };
-        if last == SequenceNumber::ZERO || self.sent.packets + 1 >= MOST_PACKETS {
+        if last == SequenceNumber::ZERO || self.sent.packets + 1 >= MAX_PACKETS {
             self.nodes = Nodes::Missing;
             return;
         }
@@ -432,9 +433,9 @@ impl Session {
 
     /// Requests missing fragments of incomplete samples.
     fn request_fragments(&mut self, now: Timestamp, outgoing: &mut Vec<Outgoing>) {
-        let due = |(_, at): &(&(EntityId, SequenceNumber), &Timestamp)| now - **at >= GATHER;
+        let due = |(_, at): &(&(EntityId, SequenceNumber), &Timestamp)| now - **at >= REQUEST_DELAY;
         let stuck: Vec<_> = self.partial.iter().filter(due).map(|(it, _)| *it).collect();
-        if stuck.is_empty() || self.partial.values().any(|at| now - *at < GATHER) {
+        if stuck.is_empty() || self.partial.values().any(|at| now - *at < REQUEST_DELAY) {
             return;
         }
         for is_builtin in [true, false] {
@@ -455,7 +456,7 @@ impl Session {
                 message = message.nack_frag(reader, *writer, *number, missing, self.requests);
                 asked = true;
             }
-            if !asked || self.sent.packets + 1 >= MOST_PACKETS {
+            if !asked || self.sent.packets + 1 >= MAX_PACKETS {
                 continue;
             }
             let what = "request for fragments";
@@ -467,7 +468,7 @@ impl Session {
             self.send(datagram, outgoing);
         }
         // Fragments have the same timeout as other requests.
-        let later = now + TIMEOUT - GATHER;
+        let later = now + REQUEST_TIMEOUT - REQUEST_DELAY;
         for at in self.partial.values_mut() {
             *at = later;
         }
@@ -475,13 +476,13 @@ impl Session {
 
     /// Returns whether all available answers have arrived.
     fn is_complete(&mut self, now: Timestamp) -> bool {
-        let Some(heard) = self.heard else {
+        let Some(first_heartbeat_at) = self.first_heartbeat else {
             return false;
         };
-        let settled = match self.asked {
-            Some(asked) => self.missing() == 0 || now - asked >= TIMEOUT,
+        let settled = match self.last_request {
+            Some(asked) => self.missing() == 0 || now - asked >= REQUEST_TIMEOUT,
             // A participant without endpoints sends HEARTBEATs with firstSN 1 and lastSN 0.
-            None => now - heard >= GATHER && self.missing() == 0,
+            None => now - first_heartbeat_at >= REQUEST_DELAY && self.missing() == 0,
         };
         if !settled {
             return false;
@@ -499,7 +500,7 @@ impl Session {
     fn end(&mut self, outgoing: &mut Vec<Outgoing>) {
         let message = self.message().goodbye(self.local);
         self.send(self.to_discovery("goodbye", message), outgoing);
-        self.over = true;
+        self.is_finished = true;
     }
 
     fn message(&self) -> Message {
@@ -513,7 +514,7 @@ impl Session {
         wanted: [(SequenceNumber, N); 2],
     ) -> Message {
         let mut message = self.message();
-        if self.wants_nodes && self.asked.is_none() {
+        if self.wants_nodes && self.last_request.is_none() {
             message = message.read_nodes(self.local);
         }
         let both = [&self.publications, &self.subscriptions];

@@ -16,22 +16,22 @@ use ros2probe_api::watches::WatchState;
 use ros2probe_daemon::config::{self, Config, StateChoice};
 
 const AREA: Area = Area::Agent;
-const FROM: &str = "GET /health";
+const HEALTH_SOURCE: &str = "GET /health";
 /// State directory of the package.
-const STATE: &str = "/var/lib/ros2probe";
-const SOCKETS: [&str; 2] = ["/proc/net/tcp", "/proc/net/tcp6"];
+const STATE_DIRECTORY: &str = "/var/lib/ros2probe";
+const SOCKET_TABLES: [&str; 2] = ["/proc/net/tcp", "/proc/net/tcp6"];
 /// State of a listening socket in `/proc/net/tcp` and `/proc/net/tcp6`.
-const LISTENING: &str = "0A";
-/// Maximum number of bytes read of each of [`SOCKETS`].
+const LISTENING_STATE: &str = "0A";
+/// Maximum number of bytes read of each of [`SOCKET_TABLES`].
 const MAX_SOCKETS: u64 = 8 << 20;
 /// Maximum number of watches in one sentence.
-const NAMED: usize = 5;
+const MAX_NAMED_WATCHES: usize = 5;
 
 /// Returns the findings about an agent that answers.
 #[must_use]
 pub fn check(answers: &Answers, place: &str, own_version: &str) -> Vec<Finding> {
     let health = &answers.health;
-    let mut findings = vec![running(health, place), version(health, own_version)];
+    let mut findings = vec![running_finding(health, place), version(health, own_version)];
     findings.extend(losses(health));
     findings.extend(limits(health));
     findings.extend(evictions(health));
@@ -39,7 +39,7 @@ pub fn check(answers: &Answers, place: &str, own_version: &str) -> Vec<Finding> 
     findings.extend(health.foxglove.as_ref().map(foxglove));
     findings.extend(zenoh(health));
     if health.source != "replay" {
-        findings.push(kept(health));
+        findings.push(kept_watches_finding(health));
     }
     findings
 }
@@ -85,18 +85,19 @@ pub fn misconfigured(path: &Path, mistakes: &str) -> Finding {
     finding.remedy("rp check-config    # prints all mistakes")
 }
 
-fn running(health: &Health, place: &str) -> Finding {
+fn running_finding(health: &Health, place: &str) -> Finding {
     let since = health
         .uptime_seconds
         .map_or_else(String::new, |up| format!(", up {}", duration(up)));
     let finding = if health.ready {
         let sentence = format!("the agent is running and sees traffic{since}");
-        Finding::new(AREA, "ready", Severity::Ok, sentence).seen("true", format!("{FROM} ready"))
+        Finding::new(AREA, "ready", Severity::Ok, sentence)
+            .seen("true", format!("{HEALTH_SOURCE} ready"))
     } else {
         let reason = health.reason.as_deref().unwrap_or("it gives no reason");
         let sentence = format!("the agent is running but sees nothing: {reason}");
         Finding::new(AREA, "ready", Severity::Problem, sentence)
-            .seen(reason, format!("{FROM} reason"))
+            .seen(reason, format!("{HEALTH_SOURCE} reason"))
             .remedy("journalctl -u ros2probe -e")
     };
     finding.seen(place, "this connection")
@@ -118,7 +119,7 @@ fn version(health: &Health, own: &str) -> Finding {
         Finding::new(AREA, "version", Severity::Note, sentence)
             .remedy("sudo systemctl restart ros2probe    # starts the installed version")
     };
-    finding.seen(health.version.as_ref(), format!("{FROM} version"))
+    finding.seen(health.version.as_ref(), format!("{HEALTH_SOURCE} version"))
 }
 
 fn losses(health: &Health) -> Vec<Finding> {
@@ -150,7 +151,7 @@ fn losses(health: &Health) -> Vec<Finding> {
                     lower bounds"
             );
             Finding::new(AREA, check, Severity::Warning, sentence)
-                .seen(count.to_string(), format!("{FROM} {check}"))
+                .seen(count.to_string(), format!("{HEALTH_SOURCE} {check}"))
                 .configure(format!(
                     "capture: {{{ring}: BYTES}}    # double it; a power of two"
                 ))
@@ -163,7 +164,7 @@ fn losses(health: &Health) -> Vec<Finding> {
             Severity::Ok,
             "no packets or records lost by the agent",
         );
-        findings.push(finding.seen("0", format!("{FROM} dropped_*")));
+        findings.push(finding.seen("0", format!("{HEALTH_SOURCE} dropped_*")));
     }
     findings
 }
@@ -189,7 +190,7 @@ fn limits(health: &Health) -> Vec<Finding> {
             reached => format!("limits.{key} {now} ({cap}): {reached} refused or evicted so far"),
         };
         let known = config::Limit::find(key);
-        let blinds = *at_limit && known.is_some_and(config::Limit::blinds);
+        let blinds = *at_limit && known.is_some_and(config::Limit::hides_data);
         let (severity, sentence) = match blinds {
             true => (
                 Severity::Problem,
@@ -200,7 +201,7 @@ fn limits(health: &Health) -> Vec<Finding> {
         let finding = Finding::new(AREA, "limits", severity, sentence);
         let finding = finding.seen(
             format!("{used} used, {reached} refused or evicted"),
-            format!("{FROM} limits {key}"),
+            format!("{HEALTH_SOURCE} limits {key}"),
         );
         let most = known.map_or(u64::MAX, |limit| limit.row().range.1 as u64);
         let twice = cap.saturating_mul(2).min(most);
@@ -236,7 +237,7 @@ fn evictions(health: &Health) -> Vec<Finding> {
             );
             let finding = Finding::new(AREA, "evictions", Severity::Warning, sentence).seen(
                 table.evictions.to_string(),
-                format!("{FROM} tables {}", table.table),
+                format!("{HEALTH_SOURCE} tables {}", table.table),
             );
             match limit(&table.table) {
                 Some(key) => finding.configure(format!(
@@ -255,7 +256,7 @@ fn evictions(health: &Health) -> Vec<Finding> {
         let finding = Finding::new(AREA, "topics_rejected", Severity::Warning, sentence);
         let finding = finding.seen(
             health.topics_rejected.to_string(),
-            format!("{FROM} topics_rejected"),
+            format!("{HEALTH_SOURCE} topics_rejected"),
         );
         findings.push(finding.configure("limits: {topics: N}    # or fewer watches"));
     }
@@ -264,7 +265,7 @@ fn evictions(health: &Health) -> Vec<Finding> {
 
 /// Returns the configuration key of a table's limit; `None` for most tables, whose limit is fixed.
 fn limit(table: &str) -> Option<&'static str> {
-    const KEYS: [(&str, &str); 7] = [
+    const LIMIT_KEYS: [(&str, &str); 7] = [
         ("deliveries", "flows"),
         ("payloads", "payload_bytes"),
         ("participants", "participants"),
@@ -273,7 +274,7 @@ fn limit(table: &str) -> Option<&'static str> {
         ("unknown_writers", "unknown_writers"),
         ("reassembly", "reassembly_bytes"),
     ];
-    let found = KEYS.iter().find(|(name, _)| *name == table);
+    let found = LIMIT_KEYS.iter().find(|(name, _)| *name == table);
     found.map(|(_, key)| *key)
 }
 
@@ -302,8 +303,8 @@ fn watches(answers: &Answers) -> Finding {
             },
         ),
         count => {
-            let named: Vec<_> = idle.iter().take(NAMED).copied().collect();
-            let more = match count.saturating_sub(NAMED) {
+            let named: Vec<_> = idle.iter().take(MAX_NAMED_WATCHES).copied().collect();
+            let more = match count.saturating_sub(MAX_NAMED_WATCHES) {
                 0 => String::new(),
                 more => format!(" and {more} more"),
             };
@@ -326,7 +327,7 @@ fn zenoh(health: &Health) -> Vec<Finding> {
         let which = format!("{connections} of Zenoh {}", unseen.text);
         let finding = |severity, sentence| {
             let count = unseen.connections.to_string();
-            let source = format!("{FROM} zenoh.unseen");
+            let source = format!("{HEALTH_SOURCE} zenoh.unseen");
             Finding::new(AREA, "zenoh", severity, sentence).seen(count, source)
         };
         match &*unseen.reason {
@@ -358,7 +359,7 @@ fn foxglove(listener: &Foxglove) -> Finding {
     if let Some(reason) = reason {
         let sentence = format!("Foxglove viewers cannot connect to {address}: {reason}");
         return Finding::new(AREA, "foxglove", Severity::Warning, sentence)
-            .seen(reason, format!("{FROM} foxglove"))
+            .seen(reason, format!("{HEALTH_SOURCE} foxglove"))
             .remedy("sudo ss -ltnp    # lists the programs that listen")
             .configure("foxglove: {listen: 127.0.0.1:PORT}    # another one, or off");
     }
@@ -389,17 +390,17 @@ fn foxglove(listener: &Foxglove) -> Finding {
             let sentence = format!("{sentence}; some read too slowly and lose messages");
             Finding::new(AREA, "foxglove", Severity::Note, sentence).seen(
                 slow.join(", "),
-                format!("{FROM} foxglove clients dropped_messages"),
+                format!("{HEALTH_SOURCE} foxglove clients dropped_messages"),
             )
         }
     };
     finding.seen(
         clients.len().to_string(),
-        format!("{FROM} foxglove clients"),
+        format!("{HEALTH_SOURCE} foxglove clients"),
     )
 }
 
-fn kept(health: &Health) -> Finding {
+fn kept_watches_finding(health: &Health) -> Finding {
     let finding = if health.watches_kept {
         let sentence = "state is kept across restarts";
         Finding::new(AREA, "state", Severity::Ok, sentence)
@@ -412,7 +413,7 @@ fn kept(health: &Health) -> Finding {
     };
     finding.seen(
         health.watches_kept.to_string(),
-        format!("{FROM} watches_kept"),
+        format!("{HEALTH_SOURCE} watches_kept"),
     )
 }
 
@@ -428,15 +429,15 @@ fn ports(host: &HostState, config: &Config) -> Vec<Finding> {
         .filter_map(|(key, address)| Some((key, address?)));
     wanted
         .filter(|(_, address)| taken.contains(&address.port()))
-        .map(|(key, address)| busy(key, address))
+        .map(|(key, address)| port_in_use_finding(key, address))
         .collect()
 }
 
-fn busy(key: &str, address: SocketAddr) -> Finding {
+fn port_in_use_finding(key: &str, address: SocketAddr) -> Finding {
     let port = address.port();
     let sentence = format!("port {port} is in use by another program: the agent would not start");
     let finding = Finding::new(AREA, "ports", Severity::Problem, sentence);
-    let finding = finding.seen(port.to_string(), SOCKETS.join(", "));
+    let finding = finding.seen(port.to_string(), SOCKET_TABLES.join(", "));
     finding
         .remedy(format!(
             "sudo ss -ltnp 'sport = :{port}'    # names the program"
@@ -446,7 +447,7 @@ fn busy(key: &str, address: SocketAddr) -> Finding {
 
 fn listening(host: &HostState) -> Vec<u16> {
     let mut ports = Vec::new();
-    for path in SOCKETS {
+    for path in SOCKET_TABLES {
         let bytes = host.files.bytes(path, MAX_SOCKETS).unwrap_or_default();
         let text = String::from_utf8_lossy(&bytes);
         ports.extend(text.lines().skip(1).filter_map(|line| {
@@ -454,7 +455,7 @@ fn listening(host: &HostState) -> Vec<u16> {
             // port, state.
             let mut fields = line.split_whitespace();
             let (_, port) = fields.nth(1)?.rsplit_once(':')?;
-            (fields.nth(1)? == LISTENING).then(|| u16::from_str_radix(port, 16).ok())?
+            (fields.nth(1)? == LISTENING_STATE).then(|| u16::from_str_radix(port, 16).ok())?
         }));
     }
     ports
@@ -465,7 +466,7 @@ fn state_directory(host: &HostState, choice: &StateChoice) -> Option<Finding> {
     let path = match choice {
         StateChoice::Off => return None,
         StateChoice::At(path) => path.display().to_string(),
-        StateChoice::Auto => STATE.to_owned(),
+        StateChoice::Auto => STATE_DIRECTORY.to_owned(),
     };
     let report = |severity, sentence: String| Finding::new(AREA, "state", severity, sentence);
     let finding = match fs::metadata(host.files.path(&path)) {

@@ -45,7 +45,7 @@ impl Answers {
     /// # Errors
     ///
     /// Fails if the agent is unreachable or sends an unexpected answer.
-    pub fn ask(agent: &Agent, domain_id: Option<u32>) -> Result<Self, ClientError> {
+    pub fn request(agent: &Agent, domain_id: Option<u32>) -> Result<Self, ClientError> {
         let within = domain_id.map_or_else(String::new, |domain| format!("?domain_id={domain}"));
         Ok(Self {
             health: agent.get("/health")?,
@@ -53,7 +53,7 @@ impl Answers {
             topics: agent.get(&format!("/topics{within}"))?,
             watches: agent.get("/watch")?,
             clocks: match agent.get("/clocks") {
-                Err(ClientError::Older { .. }) => Clocks::default(),
+                Err(ClientError::OlderAgent { .. }) => Clocks::default(),
                 answer => answer?,
             },
         })

@@ -7,7 +7,7 @@
 //! the requested size.
 
 use super::answers::Answers;
-use super::host_state::{Files, HostState, Unread};
+use super::host_state::{Files, HostState, ReadFailure};
 use ros2probe_api::doctor::{Area, Finding, Severity};
 use ros2probe_api::measurement::Measurement;
 use ros2probe_api::topics::Topic;
@@ -15,7 +15,7 @@ use ros2probe_api::topics::Topic;
 const AREA: Area = Area::Buffers;
 const RECEIVE_MAX: Sysctl = Sysctl("net.core.rmem_max");
 const RECEIVE_DEFAULT: Sysctl = Sysctl("net.core.rmem_default");
-const REASSEMBLY: [(Sysctl, Sysctl); 2] = [
+const REASSEMBLY_SYSCTLS: [(Sysctl, Sysctl); 2] = [
     (
         Sysctl("net.ipv4.ipfrag_high_thresh"),
         Sysctl("net.ipv4.ipfrag_time"),
@@ -27,15 +27,15 @@ const REASSEMBLY: [(Sysctl, Sysctl); 2] = [
 ];
 const MEBIBYTE: u64 = 1 << 20;
 /// Size in bytes above which a message needs several UDP datagrams.
-const LARGE: u64 = 64 << 10;
+const LARGE_MESSAGE: u64 = 64 << 10;
 /// Assumed message size without measurements: a typical camera image or lidar scan.
-const USUAL: u64 = 4 * MEBIBYTE;
+const DEFAULT_MESSAGE: u64 = 4 * MEBIBYTE;
 const MESSAGES_IN_BUFFER: u64 = 2;
 const MESSAGES_IN_REASSEMBLY: u64 = 16;
 /// Ratio of lost messages above which the finding is a problem.
-const MANY: f64 = 0.01;
+const PROBLEM_LOSS_RATIO: f64 = 0.01;
 /// Maximum number of topics in one sentence.
-const NAMED: usize = 3;
+const MAX_NAMED_TOPICS: usize = 3;
 
 /// Name of a kernel parameter.
 #[derive(Clone, Copy, Debug)]
@@ -54,7 +54,7 @@ pub fn check(host: &HostState, answers: Option<&Answers>) -> Vec<Finding> {
     let topics = answers.map_or(&[][..], |answers| &answers.topics.topics);
     let largest = largest(topics);
     let mut findings = vec![receive(&host.files, largest.as_ref())];
-    findings.extend(lost(
+    findings.extend(loss_finding(
         topics,
         "socket_losses",
         "in full socket buffers",
@@ -64,7 +64,7 @@ pub fn check(host: &HostState, answers: Option<&Answers>) -> Vec<Finding> {
                 .map_or(0, |received| received.lost_in_socket_buffer_messages)
         },
         |finding| {
-            let bytes = wanted(largest.as_ref(), MESSAGES_IN_BUFFER);
+            let bytes = recommended_size(largest.as_ref(), MESSAGES_IN_BUFFER);
             finding
                 .remedy(RECEIVE_DEFAULT.set(bytes))
                 .remedy(RECEIVE_MAX.set(bytes))
@@ -76,12 +76,12 @@ pub fn check(host: &HostState, answers: Option<&Answers>) -> Vec<Finding> {
     ));
     let is_large = largest
         .as_ref()
-        .is_some_and(|largest| largest.bytes > LARGE);
+        .is_some_and(|largest| largest.bytes > LARGE_MESSAGE);
     findings.extend(reassembly(
         &host.files,
         largest.as_ref().filter(|_| is_large),
     ));
-    findings.extend(lost(
+    findings.extend(loss_finding(
         topics,
         "reassembly_losses",
         "in IP reassembly, because a fragment was missing",
@@ -91,7 +91,7 @@ pub fn check(host: &HostState, answers: Option<&Answers>) -> Vec<Finding> {
                 .map_or(0, |received| received.lost_in_reassembly_messages)
         },
         |finding| {
-            let [(memory, time), _] = REASSEMBLY;
+            let [(memory, time), _] = REASSEMBLY_SYSCTLS;
             finding
                 .remedy(memory.set(128 * MEBIBYTE))
                 .remedy(time.set(3))
@@ -122,8 +122,8 @@ fn largest(topics: &[Topic<'_>]) -> Option<Largest> {
 }
 
 /// Returns the size of `messages` of the largest messages, rounded up to whole mebibytes.
-fn wanted(largest: Option<&Largest>, messages: u64) -> u64 {
-    let bytes = largest.map_or(USUAL, |largest| largest.bytes);
+fn recommended_size(largest: Option<&Largest>, messages: u64) -> u64 {
+    let bytes = largest.map_or(DEFAULT_MESSAGE, |largest| largest.bytes);
     bytes
         .saturating_mul(messages)
         .max(1)
@@ -141,7 +141,7 @@ fn receive(files: &Files, largest: Option<&Largest>) -> Finding {
                 .remedy("sysctl net.core.rmem_max    # on the host itself")
         }
         Ok(most) => {
-            let wanted = wanted(largest, MESSAGES_IN_BUFFER);
+            let wanted = recommended_size(largest, MESSAGES_IN_BUFFER);
             let (severity, words) = match largest {
                 None if *most >= wanted => (
                     Severity::Ok,
@@ -185,7 +185,7 @@ fn receive(files: &Files, largest: Option<&Largest>) -> Finding {
 
 fn reassembly(files: &Files, largest: Option<&Largest>) -> Vec<Finding> {
     let mut findings = Vec::new();
-    for (number, (memory, time)) in (0..).zip(REASSEMBLY) {
+    for (number, (memory, time)) in (0..).zip(REASSEMBLY_SYSCTLS) {
         let (bytes, seconds) = (memory.read(files), time.read(files));
         let check = if number == 0 {
             "reassembly"
@@ -203,7 +203,7 @@ fn reassembly(files: &Files, largest: Option<&Largest>) -> Vec<Finding> {
             }
             continue;
         };
-        let wanted = wanted(largest, MESSAGES_IN_REASSEMBLY);
+        let wanted = recommended_size(largest, MESSAGES_IN_REASSEMBLY);
         let version = if number == 0 { "IPv4" } else { "IPv6" };
         let finding = match largest {
             Some(largest) if most < wanted => {
@@ -239,7 +239,7 @@ fn reassembly(files: &Files, largest: Option<&Largest>) -> Vec<Finding> {
 }
 
 /// Returns the finding for messages lost at `place`; `None` if no message was lost.
-fn lost(
+fn loss_finding(
     topics: &[Topic<'_>],
     check: &'static str,
     place: &str,
@@ -256,14 +256,14 @@ fn lost(
         ratio(count(topic), received)
     };
     let worst = lossy.iter().map(|topic| ratio(topic)).fold(0.0, f64::max);
-    let severity = if worst >= MANY {
+    let severity = if worst >= PROBLEM_LOSS_RATIO {
         Severity::Problem
     } else {
         Severity::Warning
     };
     let named: Vec<_> = lossy
         .iter()
-        .take(NAMED)
+        .take(MAX_NAMED_TOPICS)
         .map(|topic| {
             format!(
                 "{} {} ({:.1} %)",
@@ -285,7 +285,7 @@ impl Sysctl {
         format!("/proc/sys/{}", self.0.replace('.', "/"))
     }
 
-    fn read(self, files: &Files) -> Result<u64, Unread> {
+    fn read(self, files: &Files) -> Result<u64, ReadFailure> {
         files.number(&self.path())
     }
 
@@ -301,7 +301,7 @@ impl Sysctl {
         )
     }
 
-    fn show(self, finding: Finding, value: &Result<u64, Unread>) -> Finding {
+    fn show(self, finding: Finding, value: &Result<u64, ReadFailure>) -> Finding {
         let value = match value {
             Ok(value) => value.to_string(),
             Err(error) => error.to_string(),

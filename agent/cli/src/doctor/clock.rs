@@ -6,7 +6,7 @@ use ros2probe_api::doctor::{Area, Finding, Severity};
 
 const AREA: Area = Area::Clock;
 /// Programs that synchronize clocks.
-const KEEPERS: [&str; 7] = [
+const TIME_DAEMONS: [&str; 7] = [
     "chronyd",
     "ntpd",
     "systemd-timesyn",
@@ -16,9 +16,9 @@ const KEEPERS: [&str; 7] = [
     "openntpd",
 ];
 /// Estimated error in microseconds above which latencies between hosts are unreliable.
-const COARSE: i64 = 10_000;
+const COARSE_ERROR_MICROSECONDS: i64 = 10_000;
 /// Maximum number of hosts in one sentence.
-const NAMED: usize = 3;
+const MAX_NAMED_HOSTS: usize = 3;
 
 /// Returns the findings of all clock checks.
 #[must_use]
@@ -50,7 +50,9 @@ pub fn check(host: &HostState) -> Vec<Finding> {
                 report(Severity::Warning, sentence).remedy(
                     "sudo apt install chrony    # on every host; for microseconds: linuxptp",
                 )
-            } else if state.maximum_error > COARSE && state.estimated_error > COARSE {
+            } else if state.maximum_error > COARSE_ERROR_MICROSECONDS
+                && state.estimated_error > COARSE_ERROR_MICROSECONDS
+            {
                 let sentence = format!(
                     "the clock is synchronised to {estimated} ms ({kept}): shorter latencies \
                      between hosts are not meaningful"
@@ -100,10 +102,15 @@ pub fn compared(clocks: &Clocks<'_>) -> Option<Finding> {
             .total_cmp(&one.offset_seconds.abs())
     });
     let apart = own.iter().filter(|offset| {
-        1e6 * (offset.offset_seconds.abs() - offset.uncertainty_seconds) > COARSE as f64
+        1e6 * (offset.offset_seconds.abs() - offset.uncertainty_seconds)
+            > COARSE_ERROR_MICROSECONDS as f64
     });
     let apart = apart.count();
-    let listed: Vec<_> = own.iter().take(NAMED).map(|offset| shown(offset)).collect();
+    let listed: Vec<_> = own
+        .iter()
+        .take(MAX_NAMED_HOSTS)
+        .map(|offset| shown(offset))
+        .collect();
     let severity = if apart > 0 {
         Severity::Warning
     } else {
@@ -130,7 +137,7 @@ fn keepers(host: &HostState) -> Vec<&'static str> {
         .into_iter()
         .filter_map(|id| {
             let name = host.files.text(&format!("/proc/{id}/comm")).ok()?;
-            KEEPERS.into_iter().find(|keeper| *keeper == name)
+            TIME_DAEMONS.into_iter().find(|keeper| *keeper == name)
         })
         .collect();
     found.sort_unstable();
@@ -153,12 +160,12 @@ fn milliseconds(microseconds: i64) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::host_state::Unread;
+    use super::super::host_state::ReadFailure;
     use super::super::host_state::tests::host;
     use super::*;
     use ros2probe_capture::system::ClockState;
 
-    fn found(clock: Result<ClockState, Unread>) -> Finding {
+    fn found(clock: Result<ClockState, ReadFailure>) -> Finding {
         let (_directory, mut host) =
             host(&[("/proc/5/comm", "chronyd\n"), ("/proc/6/comm", "sshd\n")]);
         host.clock = clock;
@@ -220,7 +227,7 @@ mod tests {
             Severity::Note
         );
         assert_eq!(found(Ok(state(false, 0, 0))).severity, Severity::Warning);
-        let unknown = found(Err(Unread::NotPermitted));
+        let unknown = found(Err(ReadFailure::NotPermitted));
         assert_eq!(unknown.severity, Severity::Unknown);
         assert!(!unknown.remedies.is_empty());
     }

@@ -14,10 +14,10 @@ const SYSCTL_FILE: &str = "etc/sysctl.d/90-ros2probe.conf";
 /// File that extends the unit, relative to the root.
 const DROP_IN: &str = "etc/systemd/system/ros2probe.service.d/90-doctor.conf";
 /// Kernel parameters that may be changed: sizes of buffers, and the compiler of BPF programs.
-const SAFE: [&str; 2] = ["net.core.", "net.ipv4.ipfrag_"];
+const SAFE_SYSCTL_PREFIXES: [&str; 2] = ["net.core.", "net.ipv4.ipfrag_"];
 /// Group that may use the agent's socket.
-const GROUP: &str = "ros2probe";
-const AMBIENT: &str = "AmbientCapabilities=";
+const AGENT_GROUP: &str = "ros2probe";
+const AMBIENT_CAPABILITIES: &str = "AmbientCapabilities=";
 
 /// A remedy.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -117,7 +117,7 @@ pub fn fixes(report: &Report, user: Option<&str>) -> Vec<Fix> {
 pub fn missing_member<'a>(groups: &str, user: Option<&'a str>) -> Option<&'a str> {
     let user = user.filter(|user| !user.is_empty() && *user != "root")?;
     let mut lines = groups.lines().map(|line| line.split(':'));
-    let mut group = lines.find(|fields| fields.clone().next() == Some(GROUP))?;
+    let mut group = lines.find(|fields| fields.clone().next() == Some(AGENT_GROUP))?;
     let mut members = group.next_back()?.split(',');
     (!members.any(|member| member == user)).then_some(user)
 }
@@ -128,7 +128,9 @@ fn sysctl(remedy: &Remedy) -> Option<(&str, u64)> {
     let (key, value) = line.split_once('=')?;
     let is_name =
         |each: char| each.is_ascii_lowercase() || each.is_ascii_digit() || "._".contains(each);
-    let is_safe = SAFE.iter().any(|prefix| key.starts_with(prefix));
+    let is_safe = SAFE_SYSCTL_PREFIXES
+        .iter()
+        .any(|prefix| key.starts_with(prefix));
     let is_safe = is_safe && key.chars().all(is_name) && !key.contains("..");
     let value = value.parse().ok().filter(|_| is_safe)?;
     (remedy.kind == RemedyTarget::Command).then_some((key, value))
@@ -136,7 +138,7 @@ fn sysctl(remedy: &Remedy) -> Option<(&str, u64)> {
 
 /// Returns the capabilities of a remedy that extends the unit.
 fn capabilities(remedy: &Remedy) -> Option<&str> {
-    let names = remedy.line.strip_prefix(AMBIENT)?;
+    let names = remedy.line.strip_prefix(AMBIENT_CAPABILITIES)?;
     let mut words = names.split(' ');
     let is_name = words.all(|word| word.starts_with("CAP_"));
     (is_name && remedy.kind == RemedyTarget::Elsewhere).then_some(names)
@@ -181,7 +183,7 @@ impl Change {
             Self::DropIn { capabilities } => {
                 let text = format!(
                     "# Written by rp doctor --fix.\n[Service]\n\
-                     CapabilityBoundingSet={capabilities}\n{AMBIENT}{capabilities}\n"
+                     CapabilityBoundingSet={capabilities}\n{AMBIENT_CAPABILITIES}{capabilities}\n"
                 );
                 write(&root.join(DROP_IN), &text)?;
                 run(&["systemctl", "daemon-reload"])?;
@@ -191,7 +193,7 @@ impl Change {
     }
 
     const fn group_command(user: &str) -> [&str; 4] {
-        ["usermod", "-aG", GROUP, user]
+        ["usermod", "-aG", AGENT_GROUP, user]
     }
 }
 

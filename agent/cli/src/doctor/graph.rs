@@ -11,14 +11,14 @@ use ros2probe_api::doctor::{Area, Finding, Severity};
 use ros2probe_api::health::Health;
 use ros2probe_api::participants::Participant;
 use ros2probe_api::topics::Topic;
-use ros2probe_daemon::missed_announcements::{self, Announces, DISCOVER};
+use ros2probe_daemon::missed_announcements::{self, Announces, DISCOVER_COMMAND};
 
 const AREA: Area = Area::Graph;
 /// Adds remedies to a finding.
-type Helps = fn(Finding) -> Finding;
+type AddRemedies = fn(Finding) -> Finding;
 
 /// Maximum number of topics in one sentence.
-const NAMED: usize = 3;
+const MAX_NAMED_TOPICS: usize = 3;
 
 /// Returns the findings of all graph checks. `processes` is the number of ROS processes on the
 /// agent's host, if it is known.
@@ -26,13 +26,13 @@ const NAMED: usize = 3;
 pub fn check(answers: &Answers, processes: Option<usize>) -> Vec<Finding> {
     let participants = &answers.participants.participants;
     let mut findings = vec![overview(answers, processes)];
-    findings.extend(alone(participants));
+    findings.extend(isolation_finding(participants));
     findings.extend(names(participants));
     findings.extend(restored(participants));
     findings.extend(unknown_writers(answers));
     findings.extend(secured(participants));
     findings.extend(announced_unseen(participants));
-    findings.extend(off_the_network(answers));
+    findings.extend(off_network_findings(answers));
     findings.extend(mismatches(&answers.topics.topics));
     findings.extend(near_misses(&answers.topics.topics));
     findings
@@ -93,8 +93,8 @@ fn overview(answers: &Answers, processes: Option<usize>) -> Finding {
         Severity::Ok,
         format!(
             "{}, {}; {}",
-            many(participants.len(), "participant"),
-            many(topics, "topic"),
+            counted_noun(participants.len(), "participant"),
+            counted_noun(topics, "topic"),
             domains.join("; ")
         ),
     )
@@ -102,15 +102,15 @@ fn overview(answers: &Answers, processes: Option<usize>) -> Finding {
 
 /// Returns whether the participant is the only one of its domain and announced no endpoints.
 /// Endpoints are announced only to other participants.
-fn is_alone(participant: &Participant<'_>, participants: &[Participant<'_>]) -> bool {
+fn is_isolated(participant: &Participant<'_>, participants: &[Participant<'_>]) -> bool {
     let has_nothing = participant.writers == 0 && participant.readers == 0;
     let others = participants.iter();
     let neighbours = others.filter(|other| other.domain_id == participant.domain_id);
     has_nothing && !participant.secured && neighbours.count() == 1
 }
 
-fn alone(participants: &[Participant<'_>]) -> Option<Finding> {
-    let is_alone = |each: &&Participant<'_>| is_alone(each, participants);
+fn isolation_finding(participants: &[Participant<'_>]) -> Option<Finding> {
+    let is_alone = |each: &&Participant<'_>| is_isolated(each, participants);
     let alone: Vec<_> = participants.iter().filter(is_alone).collect();
     let domains: Vec<_> = alone
         .iter()
@@ -128,7 +128,7 @@ fn alone(participants: &[Participant<'_>]) -> Option<Finding> {
     let finding = Finding::new(AREA, "alone", Severity::Note, sentence);
     let finding = finding.seen(domains.len().to_string(), "GET /participants");
     let remedy = remedy_of(alone.into_iter());
-    Some(finding.remedy(explained(remedy, "requests them: a few packets")))
+    Some(finding.remedy(with_comment(remedy, "requests them: a few packets")))
 }
 
 /// Returns the finding for participants that started before the agent and whose names are unknown.
@@ -137,7 +137,7 @@ fn names(participants: &[Participant<'_>]) -> Option<Finding> {
         let has_nothing = each.writers == 0 && each.readers == 0;
         let is_nameless = has_nothing || each.enclave.is_some() && each.nodes.is_empty();
         let is_silent = each.secured || each.announces_unseen;
-        !is_silent && is_nameless && !is_alone(each, participants)
+        !is_silent && is_nameless && !is_isolated(each, participants)
     };
     let nameless = participants.iter().filter(is_nameless);
     let count = nameless.clone().count();
@@ -146,11 +146,11 @@ fn names(participants: &[Participant<'_>]) -> Option<Finding> {
     }
     let sentence = format!(
         "the topics or nodes of {} are unknown: they were announced once, before the agent started",
-        many(count, "participant")
+        counted_noun(count, "participant")
     );
     let finding = Finding::new(AREA, "names", Severity::Warning, sentence);
     let finding = finding.seen(count.to_string(), "GET /participants");
-    Some(finding.remedy(explained(
+    Some(finding.remedy(with_comment(
         remedy_of(nameless),
         "a few packets; with --dry-run it only prints them",
     )))
@@ -158,11 +158,11 @@ fn names(participants: &[Participant<'_>]) -> Option<Finding> {
 
 /// Returns the command that requests the announcements of these participants.
 fn remedy_of<'a>(participants: impl Iterator<Item = &'a Participant<'a>>) -> &'static str {
-    missed_announcements::command(participants.map(Announces::of)).unwrap_or(DISCOVER)
+    missed_announcements::command(participants.map(Announces::of)).unwrap_or(DISCOVER_COMMAND)
 }
 
 /// Returns a remedy with a comment. By TCP, another participant is needed.
-fn explained(remedy: &str, requested: &str) -> String {
+fn with_comment(remedy: &str, requested: &str) -> String {
     let comment = match remedy.contains("rp discover") {
         true => requested,
         false => "joins the domain with the robot's transports, so that all announce to it",
@@ -177,7 +177,7 @@ fn restored(participants: &[Participant<'_>]) -> Option<Finding> {
     }
     let sentence = format!(
         "{} restored from saved state, awaiting confirmation; removed when the lease ends",
-        many(count, "participant")
+        counted_noun(count, "participant")
     );
     let finding = Finding::new(AREA, "restored", Severity::Note, sentence);
     Some(finding.seen(count.to_string(), "GET /participants"))
@@ -194,14 +194,14 @@ fn unknown_writers(answers: &Answers) -> Option<Finding> {
     );
     let participants = &answers.participants.participants;
     let remedy = missed_announcements::remedy_for(writers, participants)?;
-    Some(finding.remedy(explained(remedy, "requests the announcements")))
+    Some(finding.remedy(with_comment(remedy, "requests the announcements")))
 }
 
 /// Returns the finding for participants whose endpoints are announced by TCP connections that were
 /// not seen.
 fn announced_unseen(participants: &[Participant<'_>]) -> Option<Finding> {
     let is_unseen =
-        |each: &&Participant<'_>| each.announces_unseen && !is_alone(each, participants);
+        |each: &&Participant<'_>| each.announces_unseen && !is_isolated(each, participants);
     let count = participants.iter().filter(is_unseen).count();
     if count == 0 {
         return None;
@@ -209,7 +209,7 @@ fn announced_unseen(participants: &[Participant<'_>]) -> Option<Finding> {
     let sentence = format!(
         "{} announce topics and nodes by TCP, and no message by TCP was seen: the connections are \
          encrypted, or pass between other hosts",
-        many(count, "participant")
+        counted_noun(count, "participant")
     );
     let sentence = match count {
         1 => sentence.replace(" announce ", " announces "),
@@ -231,7 +231,7 @@ fn secured(participants: &[Participant<'_>]) -> Option<Finding> {
     let sentence = format!(
         "{} with DDS security: encrypted messages are not visible, nor are topics and nodes if \
          discovery is encrypted",
-        many(count, "participant")
+        counted_noun(count, "participant")
     );
     let finding = Finding::new(AREA, "secured", Severity::Note, sentence);
     let finding = finding.seen(count.to_string(), "GET /participants secured");
@@ -243,7 +243,7 @@ fn secured(participants: &[Participant<'_>]) -> Option<Finding> {
 }
 
 /// Returns the findings for topics without a pair of endpoints on the network.
-fn off_the_network(answers: &Answers) -> Vec<Finding> {
+fn off_network_findings(answers: &Answers) -> Vec<Finding> {
     let transports = [
         shared_memory(&answers.health),
         OffNetwork {
@@ -299,7 +299,7 @@ struct OffNetwork {
     severity: Severity,
     /// Verb in the plural, and the rest of the sentence.
     words: (&'static str, &'static str),
-    remedy: Option<Helps>,
+    remedy: Option<AddRemedies>,
 }
 
 impl OffNetwork {
@@ -311,8 +311,8 @@ impl OffNetwork {
         let s = if topics.len() == 1 { "s" } else { "" };
         let sentence = format!(
             "{} {verb}{s} {words}: {}",
-            many(topics.len(), "topic"),
-            listed(topics)
+            counted_noun(topics.len(), "topic"),
+            name_list(topics)
         );
         let finding = Finding::new(AREA, self.transport, self.severity, sentence);
         let finding = finding.seen(topics.len().to_string(), "GET /topics passages");
@@ -329,12 +329,12 @@ fn shared_memory(health: &Health) -> OffNetwork {
         let mut abilities = health.abilities.iter();
         abilities.any(|each| each.able && each.ability == ability)
     };
-    let (severity, words, remedy): (_, _, Option<Helps>) = if able("shared_memory_exact") {
+    let (severity, words, remedy): (_, _, Option<AddRemedies>) = if able("shared_memory_exact") {
         let words = "only Fast DDS shared memory; every message is seen";
         (Severity::Ok, words, None)
     } else if able("shared_memory") {
         let words = "only Fast DDS shared memory, which is sampled";
-        let remedy: Helps = |finding| {
+        let remedy: AddRemedies = |finding| {
             finding.configure(
                 "capture: {shm: {exact: auto}}    # every message; instruments the senders",
             )
@@ -342,7 +342,7 @@ fn shared_memory(health: &Health) -> OffNetwork {
         (Severity::Note, words, Some(remedy))
     } else {
         let words = "only Fast DDS shared memory, which is not read";
-        let remedy: Helps = |finding| finding.configure("capture: {shm: {mode: auto}}");
+        let remedy: AddRemedies = |finding| finding.configure("capture: {shm: {mode: auto}}");
         (Severity::Warning, words, Some(remedy))
     };
     OffNetwork {
@@ -396,7 +396,11 @@ fn mismatches(topics: &[Topic<'_>]) -> Vec<Finding> {
         if found.is_empty() {
             return None;
         }
-        let sentence = format!("{} {words}: {}", many(found.len(), "topic"), listed(&found));
+        let sentence = format!(
+            "{} {words}: {}",
+            counted_noun(found.len(), "topic"),
+            name_list(&found)
+        );
         let finding = Finding::new(AREA, kind, Severity::Warning, sentence);
         let finding = finding.seen(found.len().to_string(), "GET /topics diagnoses");
         Some(finding.remedy(remedy))
@@ -425,7 +429,7 @@ fn near_misses(topics: &[Topic<'_>]) -> Option<Finding> {
     let first = pairs.first()?;
     let more = match pairs.len() {
         1 => String::new(),
-        count => format!(" and {} more", many(count - 1, "pair")),
+        count => format!(" and {} more", counted_noun(count - 1, "pair")),
     };
     let sentence = format!(
         "publisher and subscription do not meet, their topics differ little: {first}{more}"
@@ -437,20 +441,20 @@ fn near_misses(topics: &[Topic<'_>]) -> Option<Finding> {
     Some(finding.remedy("ros2 run PACKAGE NODE --ros-args -r OLD:=NEW    # or correct the domain"))
 }
 
-fn listed(topics: &[&Topic<'_>]) -> String {
+fn name_list(topics: &[&Topic<'_>]) -> String {
     let names: Vec<_> = topics
         .iter()
-        .take(NAMED)
+        .take(MAX_NAMED_TOPICS)
         .map(|topic| topic.name.as_ref())
         .collect();
     let names = names.join(", ");
-    match topics.len().saturating_sub(NAMED) {
+    match topics.len().saturating_sub(MAX_NAMED_TOPICS) {
         0 => names,
         more => format!("{names} and {more} more"),
     }
 }
 
-fn many(count: usize, what: &str) -> String {
+fn counted_noun(count: usize, what: &str) -> String {
     counted(count as u64, what)
 }
 
@@ -556,7 +560,7 @@ mod tests {
     }
 
     #[test]
-    fn a_participant_alone_in_its_domain_is_reported_apart_from_missing_names() {
+    fn an_isolated_participant_is_reported_separately_from_missing_names() {
         let of = |participants: &str| {
             let participants = format!(r#"{{"participants":[{participants}]}}"#);
             check(&answers(&participants, "", ""), None)

@@ -36,7 +36,7 @@ pub struct HostState {
     /// Environment variables of this shell.
     pub environment: BTreeMap<String, String>,
     /// Clock state of the kernel.
-    pub clock: Result<ClockState, Unread>,
+    pub clock: Result<ClockState, ReadFailure>,
 }
 
 /// Files below a root directory.
@@ -47,7 +47,7 @@ pub struct Files {
 
 /// Reason why a file could not be read.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum Unread {
+pub enum ReadFailure {
     /// The file does not exist.
     #[error("not there")]
     Missing,
@@ -70,7 +70,7 @@ impl HostState {
             user_id: geteuid().as_raw(),
             group_ids: group_ids(),
             environment: environment(),
-            clock: clock_state().map_err(|error| Unread::Other(error.to_string())),
+            clock: clock_state().map_err(|error| ReadFailure::Other(error.to_string())),
         }
     }
 
@@ -99,7 +99,7 @@ impl Files {
     /// # Errors
     ///
     /// Fails if the file cannot be read.
-    pub fn text(&self, path: &str) -> Result<String, Unread> {
+    pub fn text(&self, path: &str) -> Result<String, ReadFailure> {
         let bytes = self.bytes(path, MAX_FILE)?;
         Ok(String::from_utf8_lossy(&bytes).trim_end().to_owned())
     }
@@ -109,7 +109,7 @@ impl Files {
     /// # Errors
     ///
     /// Fails if the file cannot be read.
-    pub fn bytes(&self, path: &str, most: u64) -> Result<Vec<u8>, Unread> {
+    pub fn bytes(&self, path: &str, most: u64) -> Result<Vec<u8>, ReadFailure> {
         let mut bytes = Vec::new();
         let file = File::open(self.path(path))?;
         file.take(most).read_to_end(&mut bytes)?;
@@ -121,10 +121,10 @@ impl Files {
     /// # Errors
     ///
     /// Fails if the file cannot be read, or if it does not contain a number.
-    pub fn number<T: FromStr>(&self, path: &str) -> Result<T, Unread> {
+    pub fn number<T: FromStr>(&self, path: &str) -> Result<T, ReadFailure> {
         let text = self.text(path)?;
         let number = text.parse();
-        number.map_err(|_| Unread::Other(format!("`{text}` is not a number")))
+        number.map_err(|_| ReadFailure::Other(format!("`{text}` is not a number")))
     }
 
     /// Returns the sorted names in a directory.
@@ -132,7 +132,7 @@ impl Files {
     /// # Errors
     ///
     /// Fails if the directory cannot be read.
-    pub fn names(&self, path: &str) -> Result<Vec<String>, Unread> {
+    pub fn names(&self, path: &str) -> Result<Vec<String>, ReadFailure> {
         let entries = fs::read_dir(self.path(path))?;
         let entries = entries.flatten().take(MAX_NAMES);
         let mut names: Vec<_> = entries
@@ -158,7 +158,7 @@ impl Files {
     }
 }
 
-impl From<io::Error> for Unread {
+impl From<io::Error> for ReadFailure {
     fn from(error: io::Error) -> Self {
         match error.kind() {
             io::ErrorKind::NotFound | io::ErrorKind::NotADirectory => Self::Missing,
@@ -212,7 +212,7 @@ pub(super) mod tests {
             user_id: 1000,
             group_ids: vec![1000],
             environment: BTreeMap::new(),
-            clock: Err(Unread::Missing),
+            clock: Err(ReadFailure::Missing),
         };
         (directory, host)
     }
@@ -225,9 +225,9 @@ pub(super) mod tests {
         assert_eq!(host.files.number::<u64>("/proc/a"), Ok(12));
         assert_eq!(host.files.text("/proc/b").unwrap().len(), 256 << 10);
         assert_eq!(host.files.bytes("/proc/b", 3).unwrap(), b"xxx");
-        assert_eq!(host.files.text("/proc/none"), Err(Unread::Missing));
+        assert_eq!(host.files.text("/proc/none"), Err(ReadFailure::Missing));
         let error = host.files.number::<u64>("/proc/b").unwrap_err();
-        assert!(matches!(error, Unread::Other(_)), "{error}");
+        assert!(matches!(error, ReadFailure::Other(_)), "{error}");
         assert_eq!(host.files.processes(), [7]);
         assert!(host.files.exists("/proc/a") && !host.files.exists("/etc/passwd"));
     }

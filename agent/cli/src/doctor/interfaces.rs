@@ -5,15 +5,15 @@ use ros2probe_api::doctor::{Area, Finding, Severity};
 use ros2probe_api::health::Health;
 
 const AREA: Area = Area::Interfaces;
-const PLACE: &str = "/sys/class/net";
+const SYS_CLASS_NET: &str = "/sys/class/net";
 /// Interfaces of this process's network namespace, independent of the mounted `/sys`.
-const OWN: &str = "/proc/self/net/dev";
+const PROC_NET_DEV: &str = "/proc/self/net/dev";
 /// Interface flags of `man 7 netdevice`.
-const UP: u32 = 0x1;
-const LOOPBACK: u32 = 0x8;
-const MULTICAST: u32 = 0x1000;
+const IFF_UP: u32 = 0x1;
+const IFF_LOOPBACK: u32 = 0x8;
+const IFF_MULTICAST: u32 = 0x1000;
 /// Maximum number of interfaces listed by name; a container host has hundreds.
-const LISTED: usize = 6;
+const MAX_LISTED: usize = 6;
 /// MTU below which every Cyclone DDS fragment is fragmented again by IP, in bytes.
 const SMALL_MTU: u32 = 1400;
 
@@ -30,12 +30,16 @@ struct Interface {
 /// to its own host.
 #[must_use]
 pub fn check(host: &HostState, agent: Option<&Health>, localhost: bool) -> Vec<Finding> {
-    let names = match host.files.names(PLACE) {
+    let names = match host.files.names(SYS_CLASS_NET) {
         Ok(names) => names,
         Err(error) => {
             let sentence = "the network interfaces are unknown";
             let finding = Finding::new(AREA, "interfaces", Severity::Unknown, sentence);
-            return vec![finding.seen(error.to_string(), PLACE).remedy("ip link")];
+            return vec![
+                finding
+                    .seen(error.to_string(), SYS_CLASS_NET)
+                    .remedy("ip link"),
+            ];
         }
     };
     if let Some(finding) = elsewhere(host, &names) {
@@ -45,7 +49,9 @@ pub fn check(host: &HostState, agent: Option<&Health>, localhost: bool) -> Vec<F
     let mut findings = vec![overview(&all)];
     findings.extend(loopback(&all, localhost));
     let used = || all.iter().filter(|each| each.is_used());
-    let mute: Vec<_> = used().filter(|each| each.flags & MULTICAST == 0).collect();
+    let mute: Vec<_> = used()
+        .filter(|each| each.flags & IFF_MULTICAST == 0)
+        .collect();
     if !mute.is_empty() {
         let names = list(&mute);
         let sentence = format!(
@@ -53,11 +59,11 @@ pub fn check(host: &HostState, agent: Option<&Health>, localhost: bool) -> Vec<F
              (ROS_STATIC_PEERS, a discovery server)"
         );
         let mut finding = Finding::new(AREA, "multicast", Severity::Warning, sentence);
-        for each in mute.iter().take(LISTED) {
+        for each in mute.iter().take(MAX_LISTED) {
             finding = finding
                 .seen(
                     format!("{:#x}", each.flags),
-                    format!("{PLACE}/{}/flags", each.name),
+                    format!("{SYS_CLASS_NET}/{}/flags", each.name),
                 )
                 .remedy(format!("sudo ip link set {} multicast on", each.name));
         }
@@ -71,8 +77,8 @@ pub fn check(host: &HostState, agent: Option<&Health>, localhost: bool) -> Vec<F
             list(&small)
         );
         let mut finding = Finding::new(AREA, "mtu", Severity::Note, sentence);
-        for each in small.iter().take(LISTED) {
-            let from = format!("{PLACE}/{}/mtu", each.name);
+        for each in small.iter().take(MAX_LISTED) {
+            let from = format!("{SYS_CLASS_NET}/{}/mtu", each.name);
             finding = finding.seen(each.mtu.to_string(), from);
         }
         let remedy = "<General><FragmentSize>1200B</FragmentSize></General>    # in CYCLONEDDS_URI; in \
@@ -86,7 +92,7 @@ pub fn check(host: &HostState, agent: Option<&Health>, localhost: bool) -> Vec<F
 /// Returns the finding for a `/sys` that was mounted in another network namespace and shows that
 /// one.
 fn elsewhere(host: &HostState, names: &[String]) -> Option<Finding> {
-    let table = host.files.text(OWN).ok()?;
+    let table = host.files.text(PROC_NET_DEV).ok()?;
     let own = table
         .lines()
         .filter_map(|line| Some(line.split_once(':')?.0.trim()));
@@ -106,21 +112,26 @@ fn elsewhere(host: &HostState, names: &[String]) -> Option<Finding> {
     let finding = Finding::new(AREA, "interfaces", Severity::Unknown, sentence);
     let finding = finding.seen(
         format!("{foreign} in one of them"),
-        format!("{OWN}, {PLACE}"),
+        format!("{PROC_NET_DEV}, {SYS_CLASS_NET}"),
     );
     Some(finding.remedy("ip -details link    # or: sudo ip netns exec NAME rp doctor"))
 }
 
 fn read(host: &HostState, name: &str) -> Option<Interface> {
-    let flags = host.files.text(&format!("{PLACE}/{name}/flags")).ok()?;
+    let flags = host
+        .files
+        .text(&format!("{SYS_CLASS_NET}/{name}/flags"))
+        .ok()?;
     let flags = u32::from_str_radix(flags.strip_prefix("0x")?, 16).ok()?;
-    let state = host.files.text(&format!("{PLACE}/{name}/operstate"));
+    let state = host
+        .files
+        .text(&format!("{SYS_CLASS_NET}/{name}/operstate"));
     Some(Interface {
         name: name.to_owned(),
         flags,
         mtu: host
             .files
-            .number(&format!("{PLACE}/{name}/mtu"))
+            .number(&format!("{SYS_CLASS_NET}/{name}/mtu"))
             .unwrap_or(0),
         carrier: state.is_ok_and(|state| state != "down" && state != "lowerlayerdown"),
     })
@@ -128,18 +139,19 @@ fn read(host: &HostState, name: &str) -> Option<Interface> {
 
 impl Interface {
     fn is_up(&self) -> bool {
-        self.flags & UP != 0 && self.carrier
+        self.flags & IFF_UP != 0 && self.carrier
     }
 
     /// Returns whether the interface can reach other hosts.
     fn is_used(&self) -> bool {
-        self.is_up() && self.flags & LOOPBACK == 0
+        self.is_up() && self.flags & IFF_LOOPBACK == 0
     }
 }
 
 fn overview(all: &[Interface]) -> Finding {
     let report = |severity, sentence: String| {
-        Finding::new(AREA, "interfaces", severity, sentence).seen(all.len().to_string(), PLACE)
+        Finding::new(AREA, "interfaces", severity, sentence)
+            .seen(all.len().to_string(), SYS_CLASS_NET)
     };
     let used: Vec<_> = all.iter().filter(|each| each.is_used()).collect();
     if used.is_empty() {
@@ -148,10 +160,10 @@ fn overview(all: &[Interface]) -> Finding {
     }
     let named: Vec<_> = used
         .iter()
-        .take(LISTED)
+        .take(MAX_LISTED)
         .map(|each| format!("{} (MTU {})", each.name, each.mtu))
         .collect();
-    let more = used.len().saturating_sub(LISTED);
+    let more = used.len().saturating_sub(MAX_LISTED);
     let more = if more > 0 {
         format!(" and {more} more")
     } else {
@@ -166,17 +178,17 @@ fn overview(all: &[Interface]) -> Finding {
 }
 
 fn loopback(all: &[Interface], localhost: bool) -> Option<Finding> {
-    let loopback = all.iter().find(|each| each.flags & LOOPBACK != 0)?;
+    let loopback = all.iter().find(|each| each.flags & IFF_LOOPBACK != 0)?;
     let report = |severity, sentence: String| {
-        let from = format!("{PLACE}/{}/flags", loopback.name);
+        let from = format!("{SYS_CLASS_NET}/{}/flags", loopback.name);
         Finding::new(AREA, "loopback", severity, sentence)
             .seen(format!("{:#x}", loopback.flags), from)
     };
     let name = &loopback.name;
-    Some(if loopback.flags & UP == 0 {
+    Some(if loopback.flags & IFF_UP == 0 {
         let sentence = format!("{name} is down: nodes of this host cannot use it");
         report(Severity::Problem, sentence).remedy(format!("sudo ip link set {name} up"))
-    } else if loopback.flags & MULTICAST != 0 {
+    } else if loopback.flags & IFF_MULTICAST != 0 {
         report(Severity::Ok, format!("{name} is up, with multicast"))
     } else if localhost {
         let sentence = format!(
@@ -213,7 +225,7 @@ fn looked_at(agent: &Health) -> Finding {
         _ => format!("the agent sees RTPS packets on {}", join(&names)),
     };
     let mut finding = Finding::new(AREA, "looked_at", Severity::Ok, sentence);
-    for each in agent.interfaces.iter().take(LISTED) {
+    for each in agent.interfaces.iter().take(MAX_LISTED) {
         if let Some(packets) = each.packets {
             let value = format!("{}: {packets} packets", each.interface);
             finding = finding.seen(value, "GET /health interfaces");
@@ -226,14 +238,14 @@ fn join(names: &[&str]) -> String {
     let named = names
         .iter()
         .filter(|name| !matches!(**name, "sockets" | "any" | "processes"));
-    let named: Vec<_> = named.take(LISTED).copied().collect();
+    let named: Vec<_> = named.take(MAX_LISTED).copied().collect();
     named.join(", ")
 }
 
 fn list(interfaces: &[&Interface]) -> String {
     let mut names: Vec<_> = interfaces.iter().map(|each| each.name.as_str()).collect();
-    let more = names.len().saturating_sub(LISTED);
-    names.truncate(LISTED);
+    let more = names.len().saturating_sub(MAX_LISTED);
+    names.truncate(MAX_LISTED);
     match more {
         0 => names.join(", "),
         more => format!("{} and {more} more", names.join(", ")),
@@ -250,7 +262,10 @@ mod tests {
         let mut files = Vec::new();
         for (name, flags, mtu, state) in interfaces {
             for (file, text) in [("flags", flags), ("mtu", mtu), ("operstate", state)] {
-                files.push((format!("{PLACE}/{name}/{file}"), format!("{text}\n")));
+                files.push((
+                    format!("{SYS_CLASS_NET}/{name}/{file}"),
+                    format!("{text}\n"),
+                ));
             }
         }
         let files: Vec<_> = files
@@ -320,7 +335,7 @@ mod tests {
     fn interfaces_of_another_network_namespace_are_recognized() {
         let table = "Inter-| Receive\n face |bytes\n    lo: 0 0\n  eth9: 1 2\n";
         let of = |interfaces: &[(&str, &str)]| {
-            let mut files = vec![(OWN, table)];
+            let mut files = vec![(PROC_NET_DEV, table)];
             files.extend(interfaces);
             let (_directory, host) = host(&files);
             severity(&check(&host, None, false), "interfaces")

@@ -4,19 +4,19 @@
 use std::path::Path;
 
 use super::cgroup::CgroupHierarchy;
-use super::host_state::{HostState, Unread};
+use super::host_state::{HostState, ReadFailure};
 use ros2probe_api::doctor::{Area, Finding, Severity};
 
 const AREA: Area = Area::Kernel;
-const RELEASE: &str = "/proc/sys/kernel/osrelease";
-const TYPES: &str = "/sys/kernel/btf/vmlinux";
-const COMPILER: &str = "/proc/sys/net/core/bpf_jit_enable";
-const UNPRIVILEGED: &str = "/proc/sys/kernel/unprivileged_bpf_disabled";
-const LOCKDOWN: &str = "/sys/kernel/security/lockdown";
-const MOUNTS: &str = "/proc/self/mountinfo";
-const LIMITS: &str = "/proc/self/limits";
+const RELEASE_PATH: &str = "/proc/sys/kernel/osrelease";
+const BTF_PATH: &str = "/sys/kernel/btf/vmlinux";
+const JIT_PATH: &str = "/proc/sys/net/core/bpf_jit_enable";
+const UNPRIVILEGED_BPF_PATH: &str = "/proc/sys/kernel/unprivileged_bpf_disabled";
+const LOCKDOWN_PATH: &str = "/sys/kernel/security/lockdown";
+const MOUNTS_PATH: &str = "/proc/self/mountinfo";
+const LIMITS_PATH: &str = "/proc/self/limits";
 /// Oldest release on which the filter passes the verifier.
-const OLDEST: (u32, u32) = (5, 10);
+const OLDEST_RELEASE: (u32, u32) = (5, 10);
 /// First release that does not charge BPF maps to locked memory.
 const NO_MEMLOCK: (u32, u32) = (5, 11);
 /// Size of the rings and tables of one source with a margin, in bytes.
@@ -25,7 +25,7 @@ const LOCKED_BYTES: u64 = 64 << 20;
 /// Returns the findings of all kernel checks. `is_agent_running`: an agent of this host answers.
 #[must_use]
 pub fn check(host: &HostState, is_agent_running: bool) -> Vec<Finding> {
-    let release = host.files.text(RELEASE);
+    let release = host.files.text(RELEASE_PATH);
     let mut findings = vec![
         version(&release),
         types(host),
@@ -42,14 +42,14 @@ pub fn check(host: &HostState, is_agent_running: bool) -> Vec<Finding> {
     findings
 }
 
-fn version(release: &Result<String, Unread>) -> Finding {
+fn version(release: &Result<String, ReadFailure>) -> Finding {
     let report = |severity, sentence: String| Finding::new(AREA, "version", severity, sentence);
     match release {
         Err(error) => report(Severity::Unknown, "the kernel version is unknown".into())
-            .seen(error.to_string(), RELEASE)
+            .seen(error.to_string(), RELEASE_PATH)
             .remedy("uname -r"),
         Ok(text) => match parse(text) {
-            Some(own) if own >= OLDEST => report(Severity::Ok, format!("Linux {text}")),
+            Some(own) if own >= OLDEST_RELEASE => report(Severity::Ok, format!("Linux {text}")),
             Some(_) => report(
                 Severity::Problem,
                 format!("Linux {text} is too old: live capture needs 5.10 or newer"),
@@ -60,71 +60,71 @@ fn version(release: &Result<String, Unread>) -> Finding {
                 format!("Linux `{text}`: version not recognised"),
             ),
         }
-        .seen(text, RELEASE),
+        .seen(text, RELEASE_PATH),
     }
 }
 
 fn types(host: &HostState) -> Finding {
-    if host.files.exists(TYPES) {
+    if host.files.exists(BTF_PATH) {
         return Finding::new(
             AREA,
             "types",
             Severity::Ok,
             "kernel type information (BTF) is available",
         )
-        .seen("there", TYPES);
+        .seen("there", BTF_PATH);
     }
     let sentence = "the kernel has no type information (BTF): socket owners and messages lost in \
         reassembly are unknown";
     Finding::new(AREA, "types", Severity::Warning, sentence)
-        .seen("not there", TYPES)
+        .seen("not there", BTF_PATH)
         .elsewhere("CONFIG_DEBUG_INFO_BTF=y    # in the kernel's configuration")
 }
 
 fn compiler(host: &HostState) -> Finding {
     let report = |severity, sentence| Finding::new(AREA, "jit", severity, sentence);
-    match host.files.number::<u32>(COMPILER) {
+    match host.files.number::<u32>(JIT_PATH) {
         Ok(0) => report(
             Severity::Warning,
             "BPF programs are interpreted: each packet costs several times as much",
         )
-        .seen("0", COMPILER)
+        .seen("0", JIT_PATH)
         .remedy("sudo sysctl -w net.core.bpf_jit_enable=1"),
         Ok(value) => report(Severity::Ok, "BPF programs are compiled (JIT)")
-            .seen(value.to_string(), COMPILER),
+            .seen(value.to_string(), JIT_PATH),
         // Visible only in the initial network namespace.
-        Err(Unread::Missing) => report(
+        Err(ReadFailure::Missing) => report(
             Severity::Ok,
             "BPF JIT status is not visible inside a container",
         )
-        .seen("not there", COMPILER),
+        .seen("not there", JIT_PATH),
         Err(error) => report(Severity::Unknown, "the BPF JIT status is not readable")
-            .seen(error.to_string(), COMPILER)
+            .seen(error.to_string(), JIT_PATH)
             .remedy("sudo sysctl net.core.bpf_jit_enable"),
     }
 }
 
 fn unprivileged(host: &HostState) -> Finding {
     let report = |severity, sentence| Finding::new(AREA, "unprivileged_bpf", severity, sentence);
-    match host.files.number::<u32>(UNPRIVILEGED) {
+    match host.files.number::<u32>(UNPRIVILEGED_BPF_PATH) {
         Ok(0) => report(
             Severity::Note,
             "any user can load BPF programs; the agent does not need this",
         )
-        .seen("0", UNPRIVILEGED)
+        .seen("0", UNPRIVILEGED_BPF_PATH)
         .remedy("sudo sysctl -w kernel.unprivileged_bpf_disabled=1"),
         Ok(value) => report(
             Severity::Ok,
             "unprivileged BPF is disabled; loading needs CAP_BPF",
         )
-        .seen(value.to_string(), UNPRIVILEGED),
+        .seen(value.to_string(), UNPRIVILEGED_BPF_PATH),
         Err(error) => report(Severity::Ok, "loading BPF programs needs CAP_BPF")
-            .seen(error.to_string(), UNPRIVILEGED),
+            .seen(error.to_string(), UNPRIVILEGED_BPF_PATH),
     }
 }
 
 fn lockdown(host: &HostState) -> Option<Finding> {
-    let text = host.files.text(LOCKDOWN).ok()?;
+    let text = host.files.text(LOCKDOWN_PATH).ok()?;
     let mode = text.split_once('[')?.1.split_once(']')?.0.to_owned();
     let (severity, sentence) = match mode.as_str() {
         "confidentiality" => (
@@ -138,7 +138,7 @@ fn lockdown(host: &HostState) -> Option<Finding> {
             "the kernel is locked down for integrity, which does not restrict the agent",
         ),
     };
-    let finding = Finding::new(AREA, "lockdown", severity, sentence).seen(text, LOCKDOWN);
+    let finding = Finding::new(AREA, "lockdown", severity, sentence).seen(text, LOCKDOWN_PATH);
     Some(match severity {
         Severity::Warning => {
             finding.elsewhere("lockdown=integrity    # on the kernel's command line")
@@ -149,13 +149,14 @@ fn lockdown(host: &HostState) -> Option<Finding> {
 
 fn control_groups(host: &HostState) -> Finding {
     let report = |severity, sentence: String| Finding::new(AREA, "cgroup", severity, sentence);
-    let mounts = host.files.bytes(MOUNTS, 1 << 20).unwrap_or_default();
+    let mounts = host.files.bytes(MOUNTS_PATH, 1 << 20).unwrap_or_default();
     let path = |point: &Path| host.files.path(&point.to_string_lossy());
     let (finding, point) = match CgroupHierarchy::find(&mounts, path) {
         hierarchy @ (CgroupHierarchy::NotMounted | CgroupHierarchy::Version1) => {
             let sentence = "no cgroup v2 hierarchy is mounted: the agent can observe interfaces \
                 only, not sockets";
-            let finding = report(Severity::Warning, sentence.to_owned()).seen("no cgroup2", MOUNTS);
+            let finding =
+                report(Severity::Warning, sentence.to_owned()).seen("no cgroup2", MOUNTS_PATH);
             if hierarchy == CgroupHierarchy::NotMounted {
                 return finding.remedy("sudo mount -t cgroup2 none /sys/fs/cgroup");
             }
@@ -191,7 +192,7 @@ fn control_groups(host: &HostState) -> Finding {
         }
         CgroupHierarchy::Invalid(point, reason) => (report(Severity::Warning, reason), point),
     };
-    finding.seen(point.display().to_string(), MOUNTS)
+    finding.seen(point.display().to_string(), MOUNTS_PATH)
 }
 
 fn pages(host: &HostState) -> Finding {
@@ -221,7 +222,7 @@ fn locked_memory(host: &HostState, is_agent_running: bool) -> Finding {
         false => Severity::Problem,
     };
     let report = |severity, sentence: String| Finding::new(AREA, "memlock", severity, sentence);
-    let limits = host.files.text(LIMITS).unwrap_or_default();
+    let limits = host.files.text(LIMITS_PATH).unwrap_or_default();
     let line = limits
         .lines()
         .find_map(|line| line.strip_prefix("Max locked memory"));
@@ -245,7 +246,7 @@ fn locked_memory(host: &HostState, is_agent_running: bool) -> Finding {
             "the limit of locked memory is unknown".to_owned(),
         ),
     };
-    finding.seen(soft.unwrap_or("not there"), LIMITS)
+    finding.seen(soft.unwrap_or("not there"), LIMITS_PATH)
 }
 
 /// Parses the major and minor version of a release.
@@ -260,13 +261,13 @@ mod tests {
     use super::*;
 
     const GOOD: [(&str, &str); 6] = [
-        (RELEASE, "6.8.0-31-generic\n"),
-        (TYPES, "btf"),
-        (COMPILER, "1\n"),
-        (UNPRIVILEGED, "2\n"),
-        (LOCKDOWN, "[none] integrity confidentiality\n"),
+        (RELEASE_PATH, "6.8.0-31-generic\n"),
+        (BTF_PATH, "btf"),
+        (JIT_PATH, "1\n"),
+        (UNPRIVILEGED_BPF_PATH, "2\n"),
+        (LOCKDOWN_PATH, "[none] integrity confidentiality\n"),
         (
-            MOUNTS,
+            MOUNTS_PATH,
             "24 18 0:22 / /sys/fs/cgroup rw - cgroup2 cgroup2 rw\n",
         ),
     ];
@@ -311,30 +312,37 @@ mod tests {
 
     #[test]
     fn missing_kernel_features_are_reported() {
-        gives((RELEASE, "5.4.0-42"), "version", Severity::Problem);
-        gives((RELEASE, "5.10.120-tegra"), "version", Severity::Ok);
-        gives((RELEASE, "new"), "version", Severity::Unknown);
-        gives((RELEASE, "gone"), "version", Severity::Unknown);
-        gives((TYPES, "gone"), "types", Severity::Warning);
-        gives((COMPILER, "0"), "jit", Severity::Warning);
-        gives((COMPILER, "gone"), "jit", Severity::Ok);
-        gives((UNPRIVILEGED, "0"), "unprivileged_bpf", Severity::Note);
-        let locked = "none integrity [confidentiality]";
-        gives((LOCKDOWN, locked), "lockdown", Severity::Warning);
+        gives((RELEASE_PATH, "5.4.0-42"), "version", Severity::Problem);
+        gives((RELEASE_PATH, "5.10.120-tegra"), "version", Severity::Ok);
+        gives((RELEASE_PATH, "new"), "version", Severity::Unknown);
+        gives((RELEASE_PATH, "gone"), "version", Severity::Unknown);
+        gives((BTF_PATH, "gone"), "types", Severity::Warning);
+        gives((JIT_PATH, "0"), "jit", Severity::Warning);
+        gives((JIT_PATH, "gone"), "jit", Severity::Ok);
         gives(
-            (LOCKDOWN, "none [integrity] confidentiality"),
+            (UNPRIVILEGED_BPF_PATH, "0"),
+            "unprivileged_bpf",
+            Severity::Note,
+        );
+        let locked = "none integrity [confidentiality]";
+        gives((LOCKDOWN_PATH, locked), "lockdown", Severity::Warning);
+        gives(
+            (LOCKDOWN_PATH, "none [integrity] confidentiality"),
             "lockdown",
             Severity::Ok,
         );
         gives(
-            (MOUNTS, "24 18 0:22 / /sys/fs/cgroup rw - cgroup cgroup rw"),
+            (
+                MOUNTS_PATH,
+                "24 18 0:22 / /sys/fs/cgroup rw - cgroup cgroup rw",
+            ),
             "cgroup",
             Severity::Warning,
         );
     }
 
     #[test]
-    fn the_limit_on_locked_memory_matters_on_kernels_that_charge_it() {
+    fn the_limit_on_locked_memory_is_checked_on_kernels_that_charge_it() {
         let limit =
             |value: &str| format!("Max locked memory         {value}    {value}    bytes\n");
         for (release, limit, severity) in [
@@ -344,7 +352,7 @@ mod tests {
             ("5.10.0", String::new(), Some(Severity::Unknown)),
             ("5.11.0", limit("65536"), None),
         ] {
-            let found = severities(&[(RELEASE, release), (LIMITS, &limit)]);
+            let found = severities(&[(RELEASE_PATH, release), (LIMITS_PATH, &limit)]);
             let found = found.iter().find(|(check, _)| *check == "memlock");
             assert_eq!(
                 found.map(|(_, severity)| *severity),
@@ -357,9 +365,9 @@ mod tests {
     #[test]
     fn a_low_limit_on_locked_memory_is_not_a_problem_if_an_agent_runs() {
         let (_directory, host) = host(&[
-            (RELEASE, "5.10.0"),
+            (RELEASE_PATH, "5.10.0"),
             (
-                LIMITS,
+                LIMITS_PATH,
                 "Max locked memory         65536    65536    bytes\n",
             ),
         ]);
@@ -367,7 +375,7 @@ mod tests {
     }
 
     #[test]
-    fn the_mount_beside_version_1_hides_none_of_its_controllers() {
+    fn a_version_2_mount_hides_no_controller_of_version_1() {
         for (mounts, place) in [
             (
                 "24 18 0:22 / /sys/fs/cgroup/cpu rw - cgroup cgroup rw,cpu",
@@ -375,7 +383,7 @@ mod tests {
             ),
             ("24 18 0:22 / / rw - ext4 /dev/vda rw", "/sys/fs/cgroup"),
         ] {
-            let (_directory, host) = host(&[(MOUNTS, mounts)]);
+            let (_directory, host) = host(&[(MOUNTS_PATH, mounts)]);
             let remedies = control_groups(&host).remedies;
             let mount = format!("mount -t cgroup2 none {place}");
             assert!(remedies[0].line.ends_with(&mount), "{}", remedies[0].line);

@@ -44,7 +44,7 @@ pub enum Reach {
     /// The agent answered: its answers and its address.
     Answered(Box<Answers>, String),
     /// No agent answered, for this reason.
-    Nobody(String),
+    NoAnswer(String),
     /// This user has no permission to reach the agent.
     Denied(String),
 }
@@ -64,7 +64,7 @@ pub fn examine(host: &HostState, configured: &Configured, reach: &Reach) -> Repo
     let config = &configured.config;
     let answers = match reach {
         Reach::Answered(answers, _) => Some(answers.as_ref()),
-        Reach::Nobody(_) | Reach::Denied(_) => None,
+        Reach::NoAnswer(_) | Reach::Denied(_) => None,
     };
     let health = answers.map(|answers| &answers.health);
     let processes = Processes::find(host, answers.map(|answers| &answers.participants));
@@ -76,16 +76,18 @@ pub fn examine(host: &HostState, configured: &Configured, reach: &Reach) -> Repo
     }
     findings.extend(match reach {
         Reach::Answered(answers, place) => agent::check(answers, place, env!("CARGO_PKG_VERSION")),
-        Reach::Nobody(reason) => agent::absent(host, config, reason, false),
+        Reach::NoAnswer(reason) => agent::absent(host, config, reason, false),
         Reach::Denied(reason) => agent::absent(host, config, reason, true),
     });
     findings.extend(match health {
         Some(health) => visibility::check(&Visibility::of_agent(health)),
-        None => tried(host, &config.capture),
+        None => trial_findings(host, &config.capture),
     });
     findings.extend(kernel::check(host, answers.is_some()));
     findings.extend(privileges::check(host, &config.capture, answers));
-    findings.extend(privileges::of_container(container::of_namespaces(config)));
+    findings.extend(privileges::of_container(container::namespace_restrictions(
+        config,
+    )));
     findings.extend(interfaces::check(host, health, is_local));
     findings.extend(shell::check(host));
     findings.extend(processes.check(host));
@@ -104,8 +106,8 @@ pub fn examine(host: &HostState, configured: &Configured, reach: &Reach) -> Repo
     report(name_of(host), findings)
 }
 
-/// Returns a doctor that checks this host for the clients of its agent. Checks of a user's shell and
-/// rights belong to the command alone.
+/// Returns a doctor that checks this host for the clients of its agent. Checks of a user's shell
+/// and rights belong to the command alone.
 #[must_use]
 pub fn of_agent() -> Doctor {
     Doctor::new(|own| match Answers::of(own) {
@@ -171,11 +173,11 @@ pub fn examine_capture(answers: &Answers, name: &str) -> Report {
 
 /// Returns the findings of a trial load of the kernel programs, if permitted. Does not attach
 /// uprobes.
-fn tried(host: &HostState, settings: &CaptureSettings) -> Vec<Finding> {
+fn trial_findings(host: &HostState, settings: &CaptureSettings) -> Vec<Finding> {
     if let Some(missing) = privilege::missing(host.capabilities, settings) {
         return match is_container() {
-            true => visibility::failed(&missing.to_string()),
-            false => visibility::untried(&format!("lacks {}", missing.needs())),
+            true => visibility::failed_trial_findings(&missing.to_string()),
+            false => visibility::untried_findings(&format!("lacks {}", missing.missing_text())),
         };
     }
     let mut settings = settings.clone();
@@ -183,7 +185,7 @@ fn tried(host: &HostState, settings: &CaptureSettings) -> Vec<Finding> {
     settings.inside = InsideChoice::Off;
     match run::probe(&settings) {
         Ok(facts) => visibility::check(&Visibility::of_trial(facts)),
-        Err(error) => visibility::failed(&in_words(&error)),
+        Err(error) => visibility::failed_trial_findings(&in_words(&error)),
     }
 }
 
@@ -208,7 +210,11 @@ mod tests {
     #[test]
     fn without_files_and_privileges_each_area_is_reported_once_in_order() {
         let (_directory, host) = host(&[]);
-        let report = examine(&host, &configured(), &Reach::Nobody("no agent".to_owned()));
+        let report = examine(
+            &host,
+            &configured(),
+            &Reach::NoAnswer("no agent".to_owned()),
+        );
         let listed = areas(&report);
         let mut once = listed.clone();
         once.sort();
@@ -259,7 +265,7 @@ mod tests {
         let (_directory, host) = host(&[]);
         let mut configured = configured();
         configured.mistakes = Some((PathBuf::from("/etc/x.yaml"), "bad".to_owned()));
-        let report = examine(&host, &configured, &Reach::Nobody("no agent".to_owned()));
+        let report = examine(&host, &configured, &Reach::NoAnswer("no agent".to_owned()));
         assert_eq!(report.findings[0].check, "configuration");
         assert!(report.has_problems());
     }

@@ -13,23 +13,23 @@ use ros2probe_daemon::container::Restriction;
 use ros2probe_daemon::privilege;
 
 const AREA: Area = Area::Privileges;
-const UNIT: &str = "ros2probe.service";
+const UNIT_NAME: &str = "ros2probe.service";
 /// Directories of unit files, in systemd's order of precedence.
-const UNITS: [&str; 3] = [
+const UNIT_DIRECTORIES: [&str; 3] = [
     "/etc/systemd/system",
     "/usr/lib/systemd/system",
     "/lib/systemd/system",
 ];
-const ENABLED: &str = "/etc/systemd/system/multi-user.target.wants/ros2probe.service";
-const SYSTEMD: &str = "/run/systemd/system";
+const ENABLED_LINK: &str = "/etc/systemd/system/multi-user.target.wants/ros2probe.service";
+const SYSTEMD_DIRECTORY: &str = "/run/systemd/system";
 /// Process lists of the service, in control groups v2 and v1.
-const SERVICES: [&str; 3] = [
+const SERVICE_PROCESS_LISTS: [&str; 3] = [
     "/sys/fs/cgroup/system.slice/ros2probe.service/cgroup.procs",
     "/sys/fs/cgroup/unified/system.slice/ros2probe.service/cgroup.procs",
     "/sys/fs/cgroup/systemd/system.slice/ros2probe.service/cgroup.procs",
 ];
 /// Words in paths of control groups that belong to containers.
-const CONTAINERS: [&str; 4] = ["docker", "containerd", "kubepods", "libpod"];
+const CONTAINER_CGROUP_WORDS: [&str; 4] = ["docker", "containerd", "kubepods", "libpod"];
 
 /// Returns the findings of all permission checks.
 #[must_use]
@@ -38,7 +38,7 @@ pub fn check(
     settings: &CaptureSettings,
     answers: Option<&Answers>,
 ) -> Vec<Finding> {
-    let mut findings = vec![own(host, settings, answers.is_some())];
+    let mut findings = vec![own_privileges(host, settings, answers.is_some())];
     findings.extend(answers.map(|answers| of_agent(&answers.health)));
     findings.extend(answers.and_then(containers));
     findings.extend(probes(host, settings));
@@ -46,7 +46,7 @@ pub fn check(
     findings
 }
 
-fn own(host: &HostState, settings: &CaptureSettings, is_running: bool) -> Finding {
+fn own_privileges(host: &HostState, settings: &CaptureSettings, is_running: bool) -> Finding {
     let held = privilege::capability_names(host.capabilities);
     let held = match held.len() {
         0 => "none".to_owned(),
@@ -68,7 +68,10 @@ fn own(host: &HostState, settings: &CaptureSettings, is_running: bool) -> Findin
         ),
         Some(missing) => report(
             Severity::Note,
-            format!("this shell cannot capture: it lacks {}", missing.needs()),
+            format!(
+                "this shell cannot capture: it lacks {}",
+                missing.missing_text()
+            ),
         )
         .remedy("sudo rp run    # or the service ros2probe")
         .remedy(missing.command()),
@@ -119,7 +122,11 @@ fn containers(answers: &Answers) -> Option<Finding> {
         .abilities
         .iter()
         .any(|each| each.able && each.ability == "shared_memory");
-    let is_container = |group: &str| CONTAINERS.iter().any(|word| group.contains(word));
+    let is_container = |group: &str| {
+        CONTAINER_CGROUP_WORDS
+            .iter()
+            .any(|word| group.contains(word))
+    };
     let mut participants = answers.participants.participants.iter();
     let contained =
         participants.any(|each| each.process.cgroup.as_deref().is_some_and(is_container));
@@ -151,7 +158,7 @@ fn probes(host: &HostState, settings: &CaptureSettings) -> Option<Finding> {
         (false, true) => "capture.inside needs",
         (true, true) => "capture.shm.exact and capture.inside need",
     };
-    let missing = uprobe::lacking(host.capabilities);
+    let missing = uprobe::missing_capabilities(host.capabilities);
     let socket = settings.broker.display().to_string();
     if missing.is_empty() || host.files.exists(&socket) {
         return None;
@@ -167,24 +174,24 @@ fn probes(host: &HostState, settings: &CaptureSettings) -> Option<Finding> {
 /// Returns whether the service's unit is installed.
 #[must_use]
 pub fn is_installed(host: &HostState) -> bool {
-    host.files.exists(SYSTEMD) && installed(host).is_some()
+    host.files.exists(SYSTEMD_DIRECTORY) && installed(host).is_some()
 }
 
 /// Returns the directory of the service's unit; `None` if it is not installed.
 fn installed(host: &HostState) -> Option<&'static str> {
-    let mut places = UNITS.into_iter();
-    places.find(|place| host.files.exists(&format!("{place}/{UNIT}")))
+    let mut places = UNIT_DIRECTORIES.into_iter();
+    places.find(|place| host.files.exists(&format!("{place}/{UNIT_NAME}")))
 }
 
 /// Returns the finding about the service, on hosts with systemd.
 fn unit(host: &HostState, is_answering: bool) -> Option<Finding> {
-    if !host.files.exists(SYSTEMD) {
+    if !host.files.exists(SYSTEMD_DIRECTORY) {
         return None;
     }
     let report = |severity, sentence| Finding::new(AREA, "unit", severity, sentence);
-    let installed = UNITS
+    let installed = UNIT_DIRECTORIES
         .iter()
-        .find(|place| host.files.exists(&format!("{place}/{UNIT}")));
+        .find(|place| host.files.exists(&format!("{place}/{UNIT_NAME}")));
     let Some(place) = installed else {
         return Some(
             match is_answering {
@@ -196,17 +203,17 @@ fn unit(host: &HostState, is_answering: bool) -> Option<Finding> {
             }
             .seen(
                 "not there",
-                format!("/etc/systemd/system/{UNIT} and others"),
+                format!("/etc/systemd/system/{UNIT_NAME} and others"),
             )
             .remedy("sudo apt install ./ros2probe_*.deb    # docs/install.md"),
         );
     };
-    let is_running = SERVICES.iter().any(|path| {
+    let is_running = SERVICE_PROCESS_LISTS.iter().any(|path| {
         host.files
             .text(path)
             .is_ok_and(|processes| !processes.is_empty())
     });
-    let is_enabled = std::fs::symlink_metadata(host.files.path(ENABLED)).is_ok();
+    let is_enabled = std::fs::symlink_metadata(host.files.path(ENABLED_LINK)).is_ok();
     let finding = match (is_running, is_enabled) {
         (true, true) => report(Severity::Ok, "the service ros2probe is running and enabled"),
         (true, false) => report(
@@ -232,7 +239,7 @@ fn unit(host: &HostState, is_answering: bool) -> Option<Finding> {
     );
     Some(finding.seen(
         format!("{running}, {enabled}"),
-        format!("{place}/{UNIT}, /sys/fs/cgroup"),
+        format!("{place}/{UNIT_NAME}, /sys/fs/cgroup"),
     ))
 }
 
@@ -246,8 +253,8 @@ mod tests {
 
     const INSTALLED: (&str, &str) = ("/usr/lib/systemd/system/ros2probe.service", "[Unit]");
     const BOOTED: (&str, &str) = ("/run/systemd/system/x", "");
-    const ON: (&str, &str) = (ENABLED, "");
-    const RUNNING: (&str, &str) = (SERVICES[0], "811\n");
+    const ON: (&str, &str) = (ENABLED_LINK, "");
+    const RUNNING: (&str, &str) = (SERVICE_PROCESS_LISTS[0], "811\n");
 
     #[test]
     fn the_service_is_reported_in_each_of_its_states() {
@@ -267,7 +274,7 @@ mod tests {
     fn a_shell_without_capabilities_gets_their_names_and_the_command() {
         let (_directory, mut host) = host(&[]);
         let settings = Config::default().capture;
-        let finding = own(&host, &settings, false);
+        let finding = own_privileges(&host, &settings, false);
         assert_eq!(finding.severity, Severity::Note);
         assert!(
             finding.sentence.contains("CAP_NET_ADMIN"),
@@ -280,9 +287,15 @@ mod tests {
                 .iter()
                 .any(|remedy| remedy.line.starts_with("sudo setcap "))
         );
-        assert_eq!(own(&host, &settings, true).severity, Severity::Ok);
+        assert_eq!(
+            own_privileges(&host, &settings, true).severity,
+            Severity::Ok
+        );
         host.capabilities = CapabilitySet::SYS_ADMIN | CapabilitySet::NET_ADMIN;
-        assert_eq!(own(&host, &settings, false).severity, Severity::Ok);
+        assert_eq!(
+            own_privileges(&host, &settings, false).severity,
+            Severity::Ok
+        );
     }
 
     #[test]

@@ -7,7 +7,7 @@
 
 use std::collections::BTreeMap;
 
-use super::host_state::{HostState, Unread, base_name};
+use super::host_state::{HostState, ReadFailure, base_name};
 use super::variables::{Range, Variables};
 use ros2probe_api::doctor::{Area, Finding, Severity};
 use ros2probe_api::participants::ParticipantList;
@@ -21,11 +21,11 @@ const MAX_LINE: u64 = 64 << 10;
 /// Maximum number of characters shown of a command.
 const MAX_COMMAND: usize = 40;
 /// Maximum number of processes named in one sentence, per group.
-const NAMED: usize = 4;
+const MAX_NAMED_PROCESSES: usize = 4;
 /// Name of the daemon of the `ros2` command line.
 const ROS2_DAEMON: &str = "ros2 daemon";
 /// Implementations whose messages pass only through shared memory that the agent does not read.
-const UNREAD: [&str; 2] = ["iceoryx", "iceoryx2"];
+const UNREAD_IMPLEMENTATIONS: [&str; 2] = ["iceoryx", "iceoryx2"];
 /// Maximum number of ROS processes inspected.
 const MAX_PROCESSES: usize = 2000;
 
@@ -86,8 +86,8 @@ impl Processes {
             match read_process(host, id, command, domain_id) {
                 Ok(Some(_)) if processes.found.len() >= MAX_PROCESSES => break,
                 Ok(Some(process)) => processes.found.push(process),
-                Ok(None) | Err(Unread::Missing | Unread::Other(_)) => {}
-                Err(Unread::NotPermitted) => processes.closed.push(id),
+                Ok(None) | Err(ReadFailure::Missing | ReadFailure::Other(_)) => {}
+                Err(ReadFailure::NotPermitted) => processes.closed.push(id),
             }
         }
         processes
@@ -120,25 +120,25 @@ impl Processes {
         findings.extend(self.unseen(host.is_root()));
         findings.extend(self.unread_implementations());
         findings.extend(self.agnocast());
-        let domains = self.differing(
+        let domains = self.different_values(
             "domain",
             "nodes in different domains do not see each other",
             "export ROS_DOMAIN_ID=N    # the same for all nodes",
             |process| Some(process.domain()),
         );
-        let implementations = self.differing(
+        let implementations = self.different_values(
             "rmw",
             "mixed RMWs: topics may work only partly, services are unreliable",
             "export RMW_IMPLEMENTATION=rmw_cyclonedds_cpp    # the same for all nodes",
             |process| process.implementation.map(str::to_owned),
         );
-        let ranges = self.differing(
+        let ranges = self.different_values(
             "range",
             "nodes limited to localhost are not discovered from other hosts",
             "export ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET    # the same for all; unset ROS_LOCALHOST_ONLY",
             |process| Some(process.variables.range().words()),
         );
-        let servers = self.differing(
+        let servers = self.different_values(
             "discovery_server",
             "nodes with different discovery servers do not discover each other",
             "export ROS_DISCOVERY_SERVER=ADDRESS:11811    # the same for all, or unset for all",
@@ -150,7 +150,7 @@ impl Processes {
                 ))
             },
         );
-        let easy_modes = self.differing(
+        let easy_modes = self.different_values(
             "easy_mode",
             "nodes in easy mode see only nodes with the same server",
             "export ROS2_EASY_MODE=ADDRESS    # the same for all, or unset for all",
@@ -162,7 +162,7 @@ impl Processes {
                 ))
             },
         );
-        let security = self.differing(
+        let security = self.different_values(
             "security",
             "secured and unsecured nodes do not communicate",
             "export ROS_SECURITY_ENABLE=true    # for all, or for none",
@@ -180,7 +180,7 @@ impl Processes {
             security,
         ];
         findings.extend(all.into_iter().flatten());
-        findings.extend(self.unlike(&Variables::of(&host.environment)));
+        findings.extend(self.different_domain(&Variables::of(&host.environment)));
         findings
     }
 
@@ -209,7 +209,7 @@ impl Processes {
     fn unread_implementations(&self) -> Option<Finding> {
         let unread = |process: &&Process| {
             let own = process.implementation;
-            own.is_some_and(|implementation| UNREAD.contains(&implementation))
+            own.is_some_and(|implementation| UNREAD_IMPLEMENTATIONS.contains(&implementation))
         };
         let unread: Vec<_> = self.found.iter().filter(unread).collect();
         let implementation = unread.first()?.implementation?;
@@ -264,7 +264,7 @@ impl Processes {
     }
 
     /// Warns if processes have different values of `key`.
-    fn differing(
+    fn different_values(
         &self,
         check: &'static str,
         consequence: &str,
@@ -285,7 +285,7 @@ impl Processes {
         groups.sort_by_key(|(_, group)| group.len());
         let named: Vec<_> = groups
             .iter()
-            .take(NAMED)
+            .take(MAX_NAMED_PROCESSES)
             .map(|(key, group)| format!("{key}: {}", names(group)))
             .collect();
         let sentence = format!("{consequence}; {}", named.join("; "));
@@ -299,7 +299,7 @@ impl Processes {
     }
 
     /// Warns if no process is in the domain of this shell.
-    fn unlike(&self, shell: &Variables) -> Option<Finding> {
+    fn different_domain(&self, shell: &Variables) -> Option<Finding> {
         let own = shell.domain().ok().filter(|_| shell.is_ros())?;
         let mut domains: Vec<_> = self.found.iter().map(Process::domain_id).collect();
         domains.sort_unstable();
@@ -343,7 +343,7 @@ fn read_process(
     id: u32,
     command: String,
     domain_id: Option<u32>,
-) -> Result<Option<Process>, Unread> {
+) -> Result<Option<Process>, ReadFailure> {
     let map = host.files.bytes(&format!("/proc/{id}/maps"), MAX_MAP)?;
     let map = String::from_utf8_lossy(&map);
     let implementation = implementation(&map);
@@ -371,7 +371,7 @@ fn names_of_files(map: &str) -> impl Iterator<Item = &str> {
 
 /// Returns the RMW implementation of the mapped libraries; `None` if no library belongs to one.
 fn implementation(map: &str) -> Option<&'static str> {
-    const LIBRARIES: [(&str, &str); 9] = [
+    const RMW_LIBRARIES: [(&str, &str); 9] = [
         ("librmw_zenoh_cpp.so", "Zenoh"),
         ("libddsc.so", "Cyclone DDS"),
         ("librmw_cyclonedds_cpp.so", "Cyclone DDS"),
@@ -384,7 +384,7 @@ fn implementation(map: &str) -> Option<&'static str> {
     ];
     let mut found: Vec<_> = names_of_files(map)
         .filter_map(|name| {
-            let by_name = LIBRARIES.iter().find(|(library, _)| {
+            let by_name = RMW_LIBRARIES.iter().find(|(library, _)| {
                 let rest = name.strip_prefix(library);
                 rest.is_some_and(|rest| rest.is_empty() || rest.starts_with(['.', ' ']))
             });
@@ -433,11 +433,11 @@ fn command(host: &HostState, id: u32) -> String {
 fn names(processes: &[&Process]) -> String {
     let names: Vec<_> = processes
         .iter()
-        .take(NAMED)
+        .take(MAX_NAMED_PROCESSES)
         .map(|each| each.name())
         .collect();
     let names = names.join(", ");
-    match processes.len().saturating_sub(NAMED) {
+    match processes.len().saturating_sub(MAX_NAMED_PROCESSES) {
         0 => names,
         more => format!("{names} and {more} more"),
     }

@@ -5,13 +5,13 @@ use ros2probe_api::doctor::{Area, Finding, Severity};
 use ros2probe_api::health::Ros2DaemonPort;
 
 const AREA: Area = Area::Processes;
-const CHECK: &str = "ros2_daemon";
-const FROM: &str = "GET /health ros2_daemon";
+const CHECK_NAME: &str = "ros2_daemon";
+const HEALTH_SOURCE: &str = "GET /health ros2_daemon";
 /// Commands that only query the daemon.
-const FREE: &str = "topic list/info/type/find, node list/info, service list/type/find/info, \
+const DAEMON_COMMANDS: &str = "topic list/info/type/find, node list/info, service list/type/find/info, \
     action list/info/type, completion";
 /// Commands that create a participant with any daemon.
-const NOT_FREE: &str = "topic echo/hz/bw/delay/pub, param, lifecycle get/set/list, service call, \
+const DIRECT_COMMANDS: &str = "topic echo/hz/bw/delay/pub, param, lifecycle get/set/list, service call, \
     action send_goal, doctor, --no-daemon";
 
 /// Returns the findings about the agent's ports and about real daemons, by process id and domain.
@@ -37,10 +37,13 @@ fn answering(ports: &[Ros2DaemonPort]) -> Option<Finding> {
     let plural = if domains.len() == 1 { "" } else { "s" };
     let domains = domains.join(", ");
     let sentence = format!(
-        "the agent answers as the ros2 daemon of domain{plural} {domains}; no participant for: {FREE}"
+        "the agent answers as the ros2 daemon of domain{plural} {domains}; no participant for: {DAEMON_COMMANDS}"
     );
-    let finding = Finding::new(AREA, CHECK, Severity::Ok, sentence);
-    Some(finding.seen(format!("still a participant for: {NOT_FREE}"), FROM))
+    let finding = Finding::new(AREA, CHECK_NAME, Severity::Ok, sentence);
+    Some(finding.seen(
+        format!("still a participant for: {DIRECT_COMMANDS}"),
+        HEALTH_SOURCE,
+    ))
 }
 
 /// Returns the finding for a port that the agent does not have.
@@ -53,7 +56,8 @@ fn elsewhere(port: &Ros2DaemonPort, daemons: &[(u32, Option<u32>)]) -> Finding {
     } = port;
     let report = |severity, sentence: String| {
         let reason = reason.as_deref().unwrap_or(state);
-        Finding::new(AREA, CHECK, severity, sentence).seen(reason, format!("{FROM}, port {port}"))
+        Finding::new(AREA, CHECK_NAME, severity, sentence)
+            .seen(reason, format!("{HEALTH_SOURCE}, port {port}"))
     };
     match state.as_ref() {
         "occupied" => {
@@ -105,7 +109,7 @@ fn unused(daemons: &[(u32, Option<u32>)]) -> Option<Finding> {
     };
     let sentence =
         format!("{which}: a participant whose answers can be stale; the agent can answer instead");
-    let mut finding = Finding::new(AREA, CHECK, Severity::Note, sentence);
+    let mut finding = Finding::new(AREA, CHECK_NAME, Severity::Note, sentence);
     for (id, domain) in daemons {
         let domain = domain.map_or_else(|| "unknown".to_owned(), |domain| domain.to_string());
         finding = finding.seen(format!("domain {domain}"), format!("/proc/{id}/cmdline"));

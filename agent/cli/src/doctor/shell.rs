@@ -1,19 +1,19 @@
 //! Checks of this shell's ROS variables: their effect on nodes and tools started from it, and which
 //! of their traffic the agent cannot see.
 
-use super::host_state::{HostState, Unread};
+use super::host_state::{HostState, ReadFailure};
 use super::variables::{Range, Variables};
 use ros2probe_api::doctor::{Area, Finding, Severity};
 use ros2probe_wire::DomainId;
 
 const AREA: Area = Area::Shell;
-const FROM: &str = "this shell";
+const SHELL_SOURCE: &str = "this shell";
 /// The RMW implementation without UDP ports of a domain and without DDS discovery.
-const ZENOH: &str = "rmw_zenoh_cpp";
-const PORTS: &str = "/proc/sys/net/ipv4/ip_local_port_range";
+const RMW_ZENOH: &str = "rmw_zenoh_cpp";
+const LOCAL_PORT_RANGE_PATH: &str = "/proc/sys/net/ipv4/ip_local_port_range";
 /// Maximum offset from the first port, for fifty participants on one host: 11, plus two for each
 /// other.
-const PORTS_OF_FIFTY: u32 = 11 + 2 * 49;
+const PORTS_OF_50_PARTICIPANTS: u32 = 11 + 2 * 49;
 /// Maximum number of bytes read of an XML profile.
 const MAX_PROFILE: u64 = 256 << 10;
 
@@ -38,7 +38,7 @@ pub fn check(host: &HostState) -> Vec<Finding> {
 }
 
 fn is_zenoh(variables: &Variables) -> bool {
-    variables.shown("RMW_IMPLEMENTATION").as_deref() == Some(ZENOH)
+    variables.shown("RMW_IMPLEMENTATION").as_deref() == Some(RMW_ZENOH)
 }
 
 fn none(host: &HostState) -> Finding {
@@ -53,7 +53,7 @@ fn none(host: &HostState) -> Finding {
             "ROS is not set up in this shell; the agent does not need it"
         },
     );
-    let finding = finding.seen("none", FROM);
+    let finding = finding.seen("none", SHELL_SOURCE);
     if is_sudo {
         finding.remedy("sudo -E rp doctor")
     } else {
@@ -86,19 +86,19 @@ fn domain(host: &HostState, variables: &Variables) -> Finding {
             _ => report(Severity::Ok, format!("domain {domain}")),
         },
     };
-    finding.seen(shown, format!("ROS_DOMAIN_ID, {FROM}"))
+    finding.seen(shown, format!("ROS_DOMAIN_ID, {SHELL_SOURCE}"))
 }
 
 /// Returns the range of ephemeral ports, if it is readable.
 fn ephemeral(host: &HostState) -> Option<(u32, u32)> {
-    let text = host.files.text(PORTS).ok()?;
+    let text = host.files.text(LOCAL_PORT_RANGE_PATH).ok()?;
     let mut numbers = text.split_whitespace().map(str::parse);
     Some((numbers.next()?.ok()?, numbers.next()?.ok()?))
 }
 
 fn overlaps(domain: u32, first: u32, last: u32) -> bool {
     let begin = u32::from(DomainId::PORT_BASE) + u32::from(DomainId::PORT_GAIN) * domain;
-    let end = begin + PORTS_OF_FIFTY;
+    let end = begin + PORTS_OF_50_PARTICIPANTS;
     begin <= last && end >= first
 }
 
@@ -111,7 +111,10 @@ fn implementation(variables: &Variables) -> Finding {
             "the default implementation of ROS (Fast DDS)".to_owned(),
         ),
         Some(
-            name @ ("rmw_fastrtps_cpp" | "rmw_fastrtps_dynamic_cpp" | "rmw_cyclonedds_cpp" | ZENOH),
+            name @ ("rmw_fastrtps_cpp"
+            | "rmw_fastrtps_dynamic_cpp"
+            | "rmw_cyclonedds_cpp"
+            | RMW_ZENOH),
         ) => report(Severity::Ok, name.to_owned()),
         Some(name @ ("rmw_connextdds" | "rmw_connextddsmicro")) => report(
             Severity::Note,
@@ -123,7 +126,7 @@ fn implementation(variables: &Variables) -> Finding {
         ),
     };
     let shown = name.unwrap_or_else(|| "not set".to_owned());
-    finding.seen(shown, format!("RMW_IMPLEMENTATION, {FROM}"))
+    finding.seen(shown, format!("RMW_IMPLEMENTATION, {SHELL_SOURCE}"))
 }
 
 fn range(variables: &Variables) -> Finding {
@@ -171,7 +174,7 @@ fn range(variables: &Variables) -> Finding {
         let value = variables
             .shown(name)
             .unwrap_or_else(|| "not set".to_owned());
-        finding = finding.seen(value, format!("{name}, {FROM}"));
+        finding = finding.seen(value, format!("{name}, {SHELL_SOURCE}"));
     }
     finding
 }
@@ -182,7 +185,7 @@ fn server(variables: &Variables) -> Option<Finding> {
         "discovery server at {server}: the agent sees only the discovery traffic on this host"
     );
     let finding = Finding::new(AREA, "discovery_server", Severity::Note, sentence);
-    let finding = finding.seen(server, format!("ROS_DISCOVERY_SERVER, {FROM}"));
+    let finding = finding.seen(server, format!("ROS_DISCOVERY_SERVER, {SHELL_SOURCE}"));
     Some(finding.remedy("export ROS_SUPER_CLIENT=TRUE    # ros2 tools need it"))
 }
 
@@ -196,7 +199,7 @@ fn easy_mode(variables: &Variables) -> Option<Finding> {
          agent reads their TCP, and announcements only on this host"
     );
     let finding = Finding::new(AREA, "easy_mode", Severity::Note, sentence);
-    Some(finding.seen(server, format!("{name}, {FROM}")))
+    Some(finding.seen(server, format!("{name}, {SHELL_SOURCE}")))
 }
 
 /// Returns the finding for transports selected by Fast DDS variables.
@@ -218,7 +221,7 @@ fn transports(variables: &Variables) -> Option<Finding> {
         ),
         _ => report(Severity::Ok, format!("Fast DDS uses the transports {kind}")),
     };
-    Some(finding.seen(value, format!("{name}, {FROM}")))
+    Some(finding.seen(value, format!("{name}, {SHELL_SOURCE}")))
 }
 
 fn profiles(host: &HostState, variables: &Variables) -> Vec<Finding> {
@@ -233,7 +236,7 @@ fn profiles(host: &HostState, variables: &Variables) -> Vec<Finding> {
         let report = |severity, sentence: String| {
             let shown = variables.shown(name).unwrap_or_default();
             Finding::new(AREA, "profiles", severity, sentence)
-                .seen(shown, format!("{name}, {FROM}"))
+                .seen(shown, format!("{name}, {SHELL_SOURCE}"))
         };
         match read(host, path) {
             Err(error) => report(
@@ -260,7 +263,7 @@ fn profiles(host: &HostState, variables: &Variables) -> Vec<Finding> {
 }
 
 /// Reads a file named by a variable, relative to this shell's directory.
-fn read(host: &HostState, path: &str) -> Result<Vec<u8>, Unread> {
+fn read(host: &HostState, path: &str) -> Result<Vec<u8>, ReadFailure> {
     let path = std::path::absolute(path)?;
     host.files.bytes(&path.to_string_lossy(), MAX_PROFILE)
 }
@@ -271,7 +274,7 @@ fn cyclone(host: &HostState, variables: &Variables) -> Option<Finding> {
     let shown = variables.shown(name)?;
     let report = |severity, sentence: String| {
         Finding::new(AREA, "cyclonedds", severity, sentence)
-            .seen(shown.clone(), format!("{name}, {FROM}"))
+            .seen(shown.clone(), format!("{name}, {SHELL_SOURCE}"))
     };
     let mut text = String::new();
     // The value is a comma-separated list of files and inline XML.
@@ -337,7 +340,7 @@ fn security(variables: &Variables) -> Option<Finding> {
     let mut finding = Finding::new(AREA, "security", severity, sentence);
     for name in names {
         if let Some(value) = variables.shown(name) {
-            finding = finding.seen(value, format!("{name}, {FROM}"));
+            finding = finding.seen(value, format!("{name}, {SHELL_SOURCE}"));
         }
     }
     Some(finding)
@@ -349,7 +352,7 @@ mod tests {
     use super::*;
 
     const FILES: [(&str, &str); 4] = [
-        (PORTS, "32768\t60999\n"),
+        (LOCAL_PORT_RANGE_PATH, "32768\t60999\n"),
         (
             "/home/cyclone.xml",
             "<CycloneDDS><Domain><SharedMemory>\n <Enable>true</Enable>",

@@ -11,9 +11,9 @@ const WIDTH: usize = 80;
 /// Columns before a sentence: two spaces, the severity and a space.
 const INDENT: usize = 11;
 /// Maximum number of lines of evidence for one finding without `--verbose`.
-const EVIDENCE: usize = 3;
+const MAX_EVIDENCE: usize = 3;
 /// Path of the configuration file, as printed after a line of configuration.
-const FILE: &str = "in /etc/ros2probe/ros2probe.yaml";
+const CONFIGURATION_FILE: &str = "in /etc/ros2probe/ros2probe.yaml";
 /// Maximum number of characters of one value.
 const MAX_VALUE: usize = 200;
 
@@ -99,7 +99,7 @@ impl Page {
         let shown = if self.style.verbose {
             usize::MAX
         } else {
-            EVIDENCE
+            MAX_EVIDENCE
         };
         for evidence in finding.evidence.iter().take(shown) {
             let value: String = visible(&evidence.value).chars().take(MAX_VALUE).collect();
@@ -122,8 +122,10 @@ impl Page {
         let line = visible(&remedy.line);
         let own = remedy.comment.as_deref().map(visible);
         let comment = match (remedy.kind, own) {
-            (RemedyTarget::Configuration, None) => Some(FILE.to_owned()),
-            (RemedyTarget::Configuration, Some(own)) => Some(format!("{FILE}; {own}")),
+            (RemedyTarget::Configuration, None) => Some(CONFIGURATION_FILE.to_owned()),
+            (RemedyTarget::Configuration, Some(own)) => {
+                Some(format!("{CONFIGURATION_FILE}; {own}"))
+            }
             (RemedyTarget::Command | RemedyTarget::Elsewhere, own) => own.map(Cow::into_owned),
         };
         let mut short = String::new();

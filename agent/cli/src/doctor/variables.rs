@@ -15,7 +15,7 @@ const MAX_VALUE: usize = 120;
 pub struct InvalidDomain(String);
 
 /// Variables that affect the communication of ROS.
-const NAMES: [&str; 21] = [
+const VARIABLE_NAMES: [&str; 21] = [
     "ROS_DISTRO",
     "RMW_IMPLEMENTATION",
     "ROS_DOMAIN_ID",
@@ -62,7 +62,7 @@ impl Variables {
     /// Returns the ROS variables of a shell.
     #[must_use]
     pub fn of(environment: &BTreeMap<String, String>) -> Self {
-        let known = NAMES.into_iter().filter_map(|name| {
+        let known = VARIABLE_NAMES.into_iter().filter_map(|name| {
             let value = environment.get(name).filter(|value| !value.is_empty())?;
             Some((name, value.clone()))
         });
@@ -78,7 +78,7 @@ impl Variables {
             let Some((name, value)) = text.split_once('=') else {
                 continue;
             };
-            if let Some(name) = NAMES.into_iter().find(|known| *known == name)
+            if let Some(name) = VARIABLE_NAMES.into_iter().find(|known| *known == name)
                 && !value.is_empty()
             {
                 // Of several values of one variable, getenv(3) returns the first.

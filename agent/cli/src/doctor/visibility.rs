@@ -7,9 +7,9 @@ use ros2probe_daemon::agent_facts::{Ability, AgentFacts};
 
 const AREA: Area = Area::Sight;
 /// Source of facts about a running agent.
-pub(super) const ASKED: &str = "GET /health";
+pub(super) const HEALTH_SOURCE: &str = "GET /health";
 /// Source of facts from a trial.
-pub(super) const TRIED: &str = "test load of the BPF programs";
+pub(super) const TRIAL_SOURCE: &str = "test load of the BPF programs";
 
 /// Abilities of a capture source.
 #[derive(Clone, Debug, Default)]
@@ -41,7 +41,7 @@ impl Visibility {
             source_reason: health.source_reason.clone(),
             able: able.filter_map(|each| known(&each.ability)).collect(),
             reasons: reasons.collect(),
-            from: ASKED,
+            from: HEALTH_SOURCE,
         }
     }
 
@@ -52,15 +52,15 @@ impl Visibility {
             source: facts.source.label().to_owned(),
             source_reason: facts.source_reason,
             able: facts.abilities,
-            reasons: facts.blind,
-            from: TRIED,
+            reasons: facts.missing_abilities,
+            from: TRIAL_SOURCE,
         }
     }
 }
 
 /// Returns the findings for a host without an agent and without permission for a trial.
 #[must_use]
-pub fn untried(reason: &str) -> Vec<Finding> {
+pub fn untried_findings(reason: &str) -> Vec<Finding> {
     let sentence = "kernel support was not tested";
     let finding = Finding::new(AREA, "source", Severity::Unknown, sentence);
     vec![
@@ -72,12 +72,12 @@ pub fn untried(reason: &str) -> Vec<Finding> {
 
 /// Returns the findings for a trial that failed.
 #[must_use]
-pub fn failed(error: &str) -> Vec<Finding> {
+pub fn failed_trial_findings(error: &str) -> Vec<Finding> {
     let sentence = format!("the agent cannot observe this host: {error}");
     let finding = Finding::new(AREA, "source", Severity::Problem, sentence);
     vec![
         finding
-            .seen(error, TRIED)
+            .seen(error, TRIAL_SOURCE)
             .remedy("sudo rp run    # prints the full cause"),
     ]
 }
@@ -97,7 +97,7 @@ pub fn check(visibility: &Visibility) -> Vec<Finding> {
     findings.extend(
         blind
             .into_iter()
-            .filter_map(|ability| lacking(visibility, ability)),
+            .filter_map(|ability| missing_ability_finding(visibility, ability)),
     );
     findings
 }
@@ -147,7 +147,7 @@ const fn words(ability: Ability) -> &'static str {
 }
 
 /// Returns the finding for an unavailable ability; `None` if the source's own line covers it.
-fn lacking(visibility: &Visibility, ability: Ability) -> Option<Finding> {
+fn missing_ability_finding(visibility: &Visibility, ability: Ability) -> Option<Finding> {
     let reason = visibility
         .reasons
         .iter()
@@ -355,9 +355,9 @@ mod tests {
 
     #[test]
     fn without_a_trial_the_command_for_one_is_reported() {
-        let findings = untried("CAP_BPF is missing");
+        let findings = untried_findings("CAP_BPF is missing");
         assert_eq!(findings[0].severity, Severity::Unknown);
         assert_eq!(findings[0].remedies[0].line, "sudo rp doctor");
-        assert_eq!(failed("x")[0].severity, Severity::Problem);
+        assert_eq!(failed_trial_findings("x")[0].severity, Severity::Problem);
     }
 }

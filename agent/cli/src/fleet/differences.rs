@@ -6,11 +6,11 @@ use std::fmt;
 use serde::Serialize;
 
 /// Minimum number of robots for a comparison: of two, none is usual.
-const FEWEST: usize = 3;
+const MIN_ROBOTS: usize = 3;
 /// Fraction of the usual rate by which another may differ.
-const TOLERANCE: f64 = 0.2;
+const RATE_TOLERANCE: f64 = 0.2;
 /// Rates below this one, in hertz, are not compared: an interval has too few messages.
-const SLOWEST: f64 = 0.1;
+const MIN_RATE_HZ: f64 = 0.1;
 
 /// A property of a robot that others have, too.
 #[derive(Clone, Debug, PartialEq)]
@@ -58,7 +58,7 @@ pub(super) fn find(
     robots: &BTreeMap<String, BTreeMap<String, Trait>>,
 ) -> BTreeMap<String, Vec<Difference>> {
     let mut found: BTreeMap<String, Vec<Difference>> = BTreeMap::new();
-    if robots.len() < FEWEST {
+    if robots.len() < MIN_ROBOTS {
         return found;
     }
     let properties: BTreeSet<&String> = robots.values().flat_map(BTreeMap::keys).collect();
@@ -67,7 +67,7 @@ pub(super) fn find(
             .iter()
             .map(|(name, traits)| (name, traits.get(what)))
             .collect();
-        let Some(usual) = usual(&values) else {
+        let Some(usual) = majority_value(&values) else {
             continue;
         };
         let same = |value: Option<&Trait>| is_same(value, usual);
@@ -89,7 +89,7 @@ pub(super) fn find(
 }
 
 /// Returns the value that more than half of the robots have.
-fn usual<'a>(values: &[(&String, Option<&'a Trait>)]) -> Option<Option<&'a Trait>> {
+fn majority_value<'a>(values: &[(&String, Option<&'a Trait>)]) -> Option<Option<&'a Trait>> {
     let candidates = values.iter().map(|(_, value)| *value);
     candidates
         .map(|candidate| {
@@ -107,10 +107,10 @@ fn is_same(one: Option<&Trait>, two: Option<&Trait>) -> bool {
     match (one, two) {
         (Some(Trait::Hertz(one)), Some(Trait::Hertz(two))) => {
             let (low, high) = (one.min(*two), one.max(*two));
-            high < SLOWEST || high - low <= TOLERANCE * high
+            high < MIN_RATE_HZ || high - low <= RATE_TOLERANCE * high
         }
         // A topic without a rate has no messages.
-        (Some(Trait::Hertz(rate)), None) | (None, Some(Trait::Hertz(rate))) => *rate < SLOWEST,
+        (Some(Trait::Hertz(rate)), None) | (None, Some(Trait::Hertz(rate))) => *rate < MIN_RATE_HZ,
         _ => one == two,
     }
 }

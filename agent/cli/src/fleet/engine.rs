@@ -148,7 +148,7 @@ impl Engine {
     /// # Errors
     ///
     /// Fails if the engine cannot be reached, or refuses the query.
-    pub(super) fn ask(&self, expression: &str) -> Result<Vec<(Labels, f64)>, EngineError> {
+    pub(super) fn query(&self, expression: &str) -> Result<Vec<(Labels, f64)>, EngineError> {
         let encoded = utf8_percent_encode(expression, NON_ALPHANUMERIC);
         let mut request = Request::new(Full::new(Bytes::from(format!("query={encoded}"))));
         *request.method_mut() = hyper::Method::POST;

@@ -111,7 +111,7 @@ impl Fleet {
     ///
     /// Fails if the engine cannot be reached, or refuses a query.
     pub fn read(engine: &Engine, question: &Question) -> Result<Self, EngineError> {
-        let answers = Answers::ask(engine, question)?;
+        let answers = Answers::query(engine, question)?;
         let reach = f64::from(question.reach);
         let in_reach = answers.ages.iter().filter(|(_, age)| {
             let age = value(age);
@@ -130,11 +130,11 @@ impl Fleet {
 }
 
 impl Answers {
-    fn ask(engine: &Engine, question: &Question) -> Result<Self, EngineError> {
+    fn query(engine: &Engine, question: &Question) -> Result<Self, EngineError> {
         let job = format!("job={}", quoted(&question.job));
         let ask = |expression: &str| {
             let expression = expression.replace("$JOB", &job);
-            Ok::<_, EngineError>(by_robot(engine.ask(&expression)?))
+            Ok::<_, EngineError>(by_robot(engine.query(&expression)?))
         };
         let hours = question.hours;
         Ok(Self {
@@ -163,8 +163,8 @@ impl Answers {
 
     /// Returns the properties of a robot that are compared.
     fn traits(&self, name: &str) -> BTreeMap<String, Trait> {
-        // Several domains, or topics that differ by a number, may have one key. The order in which an
-        // engine returns them is not defined.
+        // Several domains, or topics that differ by a number, may have one key. The order in which
+        // an engine returns them is not defined.
         let mut texts = BTreeMap::<String, BTreeSet<String>>::new();
         // A topic without publishers has no type and no quality of service.
         let mut text = |key: String, text: String| {

@@ -7,7 +7,7 @@ use ros2probe_daemon::escape::visible;
 use super::robot::{Fleet, Robot, State};
 
 /// Maximum number of printed differences of a robot.
-const SHOWN: usize = 12;
+const MAX_DIFFERENCES: usize = 12;
 
 impl fmt::Display for Fleet {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -73,10 +73,10 @@ fn details(f: &mut fmt::Formatter<'_>, robot: &Robot) -> fmt::Result {
     for (kind, count) in &robot.findings {
         writeln!(f, "  {count} x {}", visible(kind))?;
     }
-    for difference in robot.differences.iter().take(SHOWN) {
+    for difference in robot.differences.iter().take(MAX_DIFFERENCES) {
         writeln!(f, "  {}", visible(&difference.to_string()))?;
     }
-    match robot.differences.len().saturating_sub(SHOWN) {
+    match robot.differences.len().saturating_sub(MAX_DIFFERENCES) {
         0 => Ok(()),
         more => writeln!(f, "  ... and {more} more differences (--json)"),
     }
@@ -102,7 +102,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_fleet_is_a_table_and_the_details_of_robots_in_trouble() {
+    fn a_fleet_is_printed_as_a_table_with_details_of_faulty_robots() {
         let robot = |name: &str, state, age_s| Robot {
             name: name.to_owned(),
             state,

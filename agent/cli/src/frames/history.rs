@@ -12,7 +12,7 @@ use super::{Pose, dot};
 use crate::tables::{FrameEdges, FramePoses};
 
 /// Time for which a transform is kept after its stamp, as `tf2_ros::Buffer` keeps it by default.
-const KEPT: Duration = Duration::from_secs(10);
+const TRANSFORM_LIFETIME: Duration = Duration::from_secs(10);
 
 /// A time of the broadcasters' clock in nanoseconds.
 pub(super) type Stamp = i64;
@@ -73,7 +73,7 @@ impl History {
         let Some(poses) = self.edges.get_mut(child) else {
             return;
         };
-        let (stamp, kept) = (stamp_of(stamp), KEPT.as_nanos() as Stamp);
+        let (stamp, kept) = (stamp_of(stamp), TRANSFORM_LIFETIME.as_nanos() as Stamp);
         if poses.back().is_some_and(|last| stamp < last.stamp - kept) {
             // The broadcasters' clock went back, as at the start of another simulation.
             poses.clear();
@@ -215,7 +215,7 @@ mod tests {
     }
 
     #[test]
-    fn transforms_end_after_ten_seconds_or_when_their_clock_goes_back() {
+    fn transforms_are_dropped_after_ten_seconds_or_when_their_clock_steps_back() {
         let mut history = History::default();
         let edge = ["odom", "base"];
         history.add(edge, (10, 0), pose(1.0, 0.0));

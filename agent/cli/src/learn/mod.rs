@@ -17,7 +17,7 @@ use ros2probe_daemon::config::{Limit, PatternError, check_pattern, glob};
 
 use crate::ros2::name::is_hidden;
 use observation::Observation;
-use thresholds::Lesson;
+use thresholds::TopicThresholds;
 
 /// Maximum time to learn from, in seconds. It bounds the memory of a topic.
 pub const MAX_SECONDS: u32 = 2 * 3600;
@@ -27,7 +27,7 @@ const MIN_STEP: f64 = 0.5;
 const MAX_STEP: f64 = 60.0;
 
 /// Kinds of topics that a watch covers by their ROS name.
-const KINDS: [&str; 4] = ["topic", "action_feedback", "action_status", "service_event"];
+const WATCHABLE_KINDS: [&str; 4] = ["topic", "action_feedback", "action_status", "service_event"];
 
 /// Names and globs of the topics to learn. If empty, all topics that `ros2 topic list` shows.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -43,14 +43,14 @@ pub struct Learner {
     /// Whole seconds that were counted.
     seconds: u32,
     /// Topics that a watch cannot name, or that are beyond the limit of watches.
-    unnamed: BTreeMap<String, &'static str>,
+    unwatchable: BTreeMap<String, &'static str>,
 }
 
 /// Result of learning.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Learnt {
     /// A lesson for each topic, by name.
-    pub lessons: Vec<Lesson>,
+    pub lessons: Vec<TopicThresholds>,
     /// Time of the first and the last view, in Unix seconds.
     pub period: (f64, f64),
     /// Number of topics that no watch can name.
@@ -90,7 +90,7 @@ impl Selection {
     }
 
     fn covers(&self, topic: &Topic<'_>) -> bool {
-        if !KINDS.contains(&topic.kind.as_ref()) {
+        if !WATCHABLE_KINDS.contains(&topic.kind.as_ref()) {
             return false;
         }
         if self.0.iter().any(|pattern| *pattern == topic.name) {
@@ -111,7 +111,7 @@ impl Learner {
             topics: BTreeMap::new(),
             period: None,
             seconds: 0,
-            unnamed: BTreeMap::new(),
+            unwatchable: BTreeMap::new(),
         }
     }
 
@@ -151,7 +151,7 @@ impl Learner {
         if self.period.is_some() && elapsed < MIN_STEP {
             return;
         }
-        let steps = whole(elapsed.min(MAX_STEP)).min(MAX_SECONDS - self.seconds);
+        let steps = whole_seconds(elapsed.min(MAX_STEP)).min(MAX_SECONDS - self.seconds);
         for topic in &list.topics {
             if self.selection.covers(topic)
                 && let Some(observation) = self.observation(&topic.name)
@@ -171,15 +171,20 @@ impl Learner {
     #[must_use]
     pub fn finish(&self) -> Option<Learnt> {
         let period = self.period.filter(|_| self.seconds > 0)?;
-        let count = |wanted: &str| self.unnamed.values().filter(|why| **why == wanted).count();
+        let count = |wanted: &str| {
+            self.unwatchable
+                .values()
+                .filter(|why| **why == wanted)
+                .count()
+        };
         let lessons = self.topics.iter();
         Some(Learnt {
             lessons: lessons
-                .map(|(name, observation)| thresholds::lesson(name, observation))
+                .map(|(name, observation)| thresholds::choose_thresholds(name, observation))
                 .collect(),
             period,
-            unnamed: count(UNNAMED),
-            beyond_limit: count(BEYOND),
+            unnamed: count(UNWATCHABLE_REASON),
+            beyond_limit: count(LIMIT_REASON),
         })
     }
 
@@ -189,13 +194,13 @@ impl Learner {
         let limit = Limit::Watches.row().default;
         if !self.topics.contains_key(name) {
             let why = match (check_pattern(name).is_err(), self.topics.len() >= limit) {
-                (true, _) => Some(UNNAMED),
-                (_, true) => Some(BEYOND),
+                (true, _) => Some(UNWATCHABLE_REASON),
+                (_, true) => Some(LIMIT_REASON),
                 _ => None,
             };
             if let Some(why) = why {
-                if self.unnamed.len() < limit {
-                    self.unnamed.insert(name.to_owned(), why);
+                if self.unwatchable.len() < limit {
+                    self.unwatchable.insert(name.to_owned(), why);
                 }
                 return None;
             }
@@ -206,8 +211,8 @@ impl Learner {
     }
 }
 
-const UNNAMED: &str = "no watch can name it";
-const BEYOND: &str = "limits.watches";
+const UNWATCHABLE_REASON: &str = "no watch can name it";
+const LIMIT_REASON: &str = "limits.watches";
 
 /// Rounds a time of 0 to 60 s to whole seconds.
 #[expect(
@@ -215,7 +220,7 @@ const BEYOND: &str = "limits.watches";
     clippy::cast_sign_loss,
     reason = "from 0 to 60"
 )]
-fn whole(seconds: f64) -> u32 {
+fn whole_seconds(seconds: f64) -> u32 {
     seconds.max(0.0).round() as u32
 }
 

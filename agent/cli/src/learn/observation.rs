@@ -15,7 +15,7 @@ pub struct Observation {
     /// Whether messages were sampled in shared memory.
     pub is_sampled: bool,
     /// Number of messages with a timestamp later than their capture, or an hour away from it.
-    pub odd_timestamps: u64,
+    pub implausible_timestamps: u64,
     /// The agent's explanation of why it sees no message.
     pub reason: Option<String>,
 }
@@ -39,7 +39,7 @@ impl Observation {
             seconds: Vec::new(),
             totals: None,
             is_sampled: false,
-            odd_timestamps: 0,
+            implausible_timestamps: 0,
             reason: None,
         }
     }
@@ -88,15 +88,15 @@ impl Observation {
                 lost: share(since.lost, step, steps),
                 expected: share(since.expected, step, steps),
                 delayed: share(since.delayed, step, steps),
-                delay: narrow(since.delay / f64::from(steps)),
+                delay: to_f32(since.delay / f64::from(steps)),
                 silence: last
                     .filter(|_| totals.is_some())
-                    .map(|last| narrow((now - left - last).max(0.0))),
+                    .map(|last| to_f32((now - left - last).max(0.0))),
                 publishers: u16::try_from(topic.publishers.len()).unwrap_or(u16::MAX),
                 subscriptions: u16::try_from(topic.subscriptions.len()).unwrap_or(u16::MAX),
             });
         }
-        self.odd_timestamps += since.odd_timestamps;
+        self.implausible_timestamps += since.odd_timestamps;
         self.is_sampled |= measurement.is_some_and(|it| it.sampled.is_some());
         self.reason = reason(topic);
         self.totals = totals.or(before);
@@ -166,6 +166,6 @@ const fn count(messages: u64) -> f64 {
     clippy::cast_possible_truncation,
     reason = "thresholds need three digits"
 )]
-const fn narrow(value: f64) -> f32 {
+const fn to_f32(value: f64) -> f32 {
     value as f32
 }

@@ -2,9 +2,9 @@
 
 /// Factor from the median absolute deviation (MAD) to the standard deviation of a normal
 /// distribution.
-const NORMAL: f64 = 1.4826;
+const MAD_TO_DEVIATION: f64 = 1.4826;
 /// Significant digits of a threshold.
-const DIGITS: i32 = 3;
+const SIGNIFICANT_DIGITS: i32 = 3;
 
 /// Summary statistics of a set of values.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -36,7 +36,7 @@ impl Summary {
             median,
             p95: quantile(&values, 0.95)?,
             maximum,
-            deviation: NORMAL * quantile(&deviations, 0.5)?,
+            deviation: MAD_TO_DEVIATION * quantile(&deviations, 0.5)?,
         })
     }
 }
@@ -78,7 +78,7 @@ fn rounded(value: f64, round: fn(f64) -> f64) -> f64 {
     if !(value.is_finite() && value > 0.0) {
         return 0.0;
     }
-    let shift = DIGITS - 1 - value.log10().floor() as i32;
+    let shift = SIGNIFICANT_DIGITS - 1 - value.log10().floor() as i32;
     let scale = 10_f64.powi(shift.abs());
     // The quotient of integers is the float nearest to the decimal number, so it prints with few
     // digits.
@@ -114,7 +114,7 @@ mod tests {
     fn the_deviation_of_a_uniform_spread_is_scaled() {
         let summary = Summary::of((0..=100).map(f64::from)).unwrap();
         assert_eq!((summary.median, summary.p95), (50.0, 95.0));
-        assert!((summary.deviation - 25.0 * NORMAL).abs() < 1e-9);
+        assert!((summary.deviation - 25.0 * MAD_TO_DEVIATION).abs() < 1e-9);
     }
 
     #[test]

@@ -79,12 +79,12 @@ impl Robot {
         self.view();
     }
 
-    fn lesson(&self) -> Lesson {
+    fn lesson(&self) -> TopicThresholds {
         self.learner.finish().unwrap().lessons.remove(0)
     }
 }
 
-fn left_out(lesson: &Lesson, key: &str) -> String {
+fn left_out(lesson: &TopicThresholds, key: &str) -> String {
     let mut remarks = lesson.remarks.iter();
     remarks
         .find_map(|remark| match remark {
@@ -165,7 +165,7 @@ fn a_busy_robot_violates_its_expectations_at_half_its_rate_and_not_otherwise() {
     let learnt = seconds(0, 120, 1);
     let counts = || learnt.iter().map(|second| second.messages);
     assert_eq!((counts().min(), counts().max()), (Some(28), Some(46)));
-    let lesson = thresholds::lesson("/odom", &Observation::of(learnt.clone()));
+    let lesson = thresholds::choose_thresholds("/odom", &Observation::of(learnt.clone()));
     let values = lesson.values;
     let window = values.window_s.unwrap();
     let low = values.min_rate_hz.unwrap();
@@ -340,7 +340,7 @@ fn a_file_is_never_larger_than_an_agent_reads() {
     let mut learnt = robot.learner.finish().unwrap();
     let lesson = learnt.lessons.remove(0);
     learnt.lessons = (0..Limit::Watches.row().default)
-        .map(|number| Lesson {
+        .map(|number| TopicThresholds {
             topic: format!("/t{number}{}", "x".repeat(250)),
             remarks: [
                 &lesson.remarks[..],
@@ -376,7 +376,7 @@ proptest! {
                 silence: last, publishers, subscriptions,
             });
         }
-        let lesson = thresholds::lesson("/x", &Observation::of(list.clone()));
+        let lesson = thresholds::choose_thresholds("/x", &Observation::of(list.clone()));
         let expectations = lesson.values.try_into().unwrap();
         prop_assert_eq!(rehearsal::violations(&expectations, &list), Vec::<&str>::new());
     }
@@ -395,7 +395,7 @@ proptest! {
                 subscriptions: 1, ..Second::default()
             }).collect()
         };
-        let lesson = thresholds::lesson("/x", &Observation::of(make(1.0)));
+        let lesson = thresholds::choose_thresholds("/x", &Observation::of(make(1.0)));
         if lesson.values.min_rate_hz.is_some() {
             let expectations = lesson.values.try_into().unwrap();
             let violated = rehearsal::violations(&expectations, &make(0.5));

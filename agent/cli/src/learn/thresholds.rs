@@ -6,7 +6,7 @@
 
 use std::ops::RangeInclusive;
 
-use ros2probe_daemon::config::rehearsal::{self, GRACE, Second};
+use ros2probe_daemon::config::rehearsal::{self, STARTUP_GRACE_SECONDS, Second};
 use ros2probe_daemon::config::watch::ExpectationValues;
 use ros2probe_daemon::config::{Expectations, LossShare};
 
@@ -21,13 +21,13 @@ pub const RATE_DEVIATIONS: f64 = 4.0;
 const RATE_LIMITS: (f64, f64) = (0.6, 1.6);
 /// Minimum distance of the minimum rate from half the median, in messages of a window. Half the
 /// rate then violates the minimum, in spite of the agent's tolerance of one message.
-const TOLERANCE: f64 = 1.0;
+const MESSAGE_TOLERANCE: f64 = 1.0;
 /// Windows in seconds for rates that vary too much in the agent's default window.
-const WINDOWS: [u64; 4] = [2, 3, 5, rehearsal::SECONDS];
+const WINDOW_SECONDS: [u64; 4] = [2, 3, 5, rehearsal::SECONDS];
 /// Minimum rate with a band: three messages are due in the agent's longest window of 10 s.
-const SLOWEST: f64 = 0.3;
+const MIN_RATE_HZ: f64 = 0.3;
 /// Minimum number of seconds and of messages to learn from.
-const LEAST: usize = 10;
+const MIN_OBSERVATIONS: usize = 10;
 /// Margin of a silence, as a factor of the longest observed one.
 pub const SILENCE_MARGIN: f64 = 3.0;
 /// Minimum learnt silence in seconds, since the agent evaluates once a second.
@@ -46,7 +46,7 @@ const LATENCY_MARGIN: f64 = 0.005;
 
 /// Expectations of one topic.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Lesson {
+pub struct TopicThresholds {
     /// ROS name.
     pub topic: String,
     /// Values of the expectations.
@@ -66,9 +66,9 @@ pub enum Remark {
 
 /// Chooses the expectations of a topic.
 #[must_use]
-pub fn lesson(topic: &str, observation: &Observation) -> Lesson {
+pub fn choose_thresholds(topic: &str, observation: &Observation) -> TopicThresholds {
     let mut draft = Draft::new(observation);
-    if draft.messages < LEAST as u64 {
+    if draft.messages < MIN_OBSERVATIONS as u64 {
         draft.too_few();
     } else {
         draft.rate();
@@ -77,8 +77,8 @@ pub fn lesson(topic: &str, observation: &Observation) -> Lesson {
         draft.silence();
     }
     draft.endpoints();
-    draft.reconcile();
-    Lesson {
+    draft.drop_conflicting();
+    TopicThresholds {
         topic: topic.to_owned(),
         values: draft.values,
         remarks: draft.remarks,
@@ -139,7 +139,7 @@ impl<'a> Draft<'a> {
         candidates.find(|it| limits.contains(it) && !self.violates(expecting(*it)))
     }
 
-    fn leave_out(&mut self, keys: &'static str, why: impl Into<String>) {
+    fn omit(&mut self, keys: &'static str, why: impl Into<String>) {
         self.remarks.push(Remark::LeftOut(keys, why.into()));
     }
 
@@ -149,49 +149,53 @@ impl<'a> Draft<'a> {
             (None, 0) => "no message was seen".to_owned(),
             (_, messages) => format!("{messages} messages are too few"),
         };
-        self.leave_out("rate, loss, latency and silence", why);
+        self.omit("rate, loss, latency and silence", why);
     }
 
     fn rate(&mut self) {
         const KEYS: &str = "min_rate_hz and max_rate_hz";
         let seconds = self.complete.len();
-        if seconds < LEAST {
-            return self.leave_out(KEYS, format!("{seconds} s are too short"));
+        if seconds < MIN_OBSERVATIONS {
+            return self.omit(KEYS, format!("{seconds} s are too short"));
         }
         let messages: u64 = self.complete.iter().map(|it| u64::from(it.messages)).sum();
         let mean = number(messages) / number(seconds as u64);
         let lowest = mean * (1.0 - RATE_MARGIN);
-        if lowest < SLOWEST {
+        if lowest < MIN_RATE_HZ {
             let why = format!("{messages} messages in {seconds} s are too seldom for a rate");
-            return self.leave_out(KEYS, why);
+            return self.omit(KEYS, why);
         }
         let default = rehearsal::window(lowest);
-        let wider = WINDOWS.into_iter().filter(|seconds| *seconds > default);
+        let wider = WINDOW_SECONDS
+            .into_iter()
+            .filter(|seconds| *seconds > default);
         let lengths = std::iter::once(default).chain(wider);
         let windows: Vec<Windows> = lengths
             .filter_map(|seconds| self.windows(seconds, default))
             .collect();
         let Some(shortest) = windows.first() else {
-            return self.leave_out(KEYS, "no message arrived for most of the time");
+            return self.omit(KEYS, "no message arrived for most of the time");
         };
         // The shortest window is best that detects half the rate and that the topic never violates.
-        let usual = |it: &&Windows| it.is_above(it.lows()[0]) && self.accepts_low(it, it.lows()[0]);
-        let widest = |it: &&Windows| self.accepts_low(it, it.lows()[1]);
+        let usual = |it: &&Windows| {
+            it.is_above(it.min_rates()[0]) && self.accepts_low(it, it.min_rates()[0])
+        };
+        let widest = |it: &&Windows| self.accepts_low(it, it.min_rates()[1]);
         let chosen = windows.iter().find(usual);
         let chosen = chosen.or_else(|| windows.iter().find(widest));
-        self.band(chosen.unwrap_or(shortest));
+        self.choose_rate_band(chosen.unwrap_or(shortest));
     }
 
     /// Chooses the minimum and the maximum rate.
-    fn band(&mut self, windows: &Windows) {
+    fn choose_rate_band(&mut self, windows: &Windows) {
         let Windows { seconds, rates, .. } = windows;
-        let [usual, widest] = windows.lows();
+        let [usual, widest] = windows.min_rates();
         let lows = match windows.is_above(usual) {
             true => [usual, widest],
             false => [widest, usual],
         };
         let low = lows.into_iter().find(|low| self.accepts_low(windows, *low));
-        let [usual, widest] = windows.highs();
+        let [usual, widest] = windows.max_rates();
         let highs = match windows.is_below(usual) {
             true => [usual, widest],
             false => [widest, usual],
@@ -201,11 +205,11 @@ impl<'a> Draft<'a> {
         });
         let seen = format!(
             "{} to {} Hz in windows of {seconds} s",
-            short(rates.minimum),
-            short(rates.maximum)
+            three_digits(rates.minimum),
+            three_digits(rates.maximum)
         );
         let varies = format!("the rate varies: {seen}");
-        let seen = format!("median {} Hz, {seen}", short(rates.median));
+        let seen = format!("median {} Hz, {seen}", three_digits(rates.median));
         self.set("min_rate_hz", low, seen, &varies);
         self.set("max_rate_hz", high, String::new(), &varies);
         self.values = windows.expecting(low, high);
@@ -260,7 +264,7 @@ impl<'a> Draft<'a> {
         let ratios = windows.iter().filter_map(|share| share.ratio());
         let sent = windows.iter().map(|share| number(share.expected));
         let (Some(ratios), Some(sent)) = (Summary::of(ratios), Summary::of(sent)) else {
-            return self.leave_out(KEY, "the topic was seen for less than 10 s");
+            return self.omit(KEY, "the topic was seen for less than 10 s");
         };
         // One lost message in a window is not a fault.
         let base = LEAST_LOSS.max(1.5 / sent.median);
@@ -273,10 +277,10 @@ impl<'a> Draft<'a> {
         let seen = format!(
             "{lost} of {} messages lost, at most {} % in 10 s",
             expected,
-            short(ratios.maximum * 100.0)
+            three_digits(ratios.maximum * 100.0)
         );
         let why = if base > MOST_LOSS {
-            format!("{} messages in 10 s are too few", short(sent.median))
+            format!("{} messages in 10 s are too few", three_digits(sent.median))
         } else {
             format!("the loss varies: {seen}")
         };
@@ -287,23 +291,23 @@ impl<'a> Draft<'a> {
     fn latency(&mut self) {
         const KEY: &str = "max_latency_ms";
         if self.observation.is_sampled {
-            return self.leave_out(KEY, "the topic is sampled in shared memory");
+            return self.omit(KEY, "the topic is sampled in shared memory");
         }
-        let odd = self.observation.odd_timestamps;
+        let odd = self.observation.implausible_timestamps;
         if odd > 0 {
             let why = format!(
                 "{odd} messages are stamped later than their capture, or an hour away: the clocks \
                  differ"
             );
-            return self.leave_out(KEY, why);
+            return self.omit(KEY, why);
         }
         let stamped = self.seconds.iter().filter(|second| second.delayed > 0);
         let means: Vec<f64> = stamped
             .map(|second| f64::from(second.delay) / f64::from(second.delayed))
             .collect();
         let count = means.len();
-        let Some(means) = Summary::of(means).filter(|_| count >= LEAST) else {
-            return self.leave_out(
+        let Some(means) = Summary::of(means).filter(|_| count >= MIN_OBSERVATIONS) else {
+            return self.omit(
                 KEY,
                 format!("{count} s with writer's timestamps are too few"),
             );
@@ -321,9 +325,9 @@ impl<'a> Draft<'a> {
         });
         let seen = format!(
             "one-second means: median {} ms, 95 % below {}, at most {}",
-            short(means.median * 1e3),
-            short(means.p95 * 1e3),
-            short(means.maximum * 1e3)
+            three_digits(means.median * 1e3),
+            three_digits(means.p95 * 1e3),
+            three_digits(means.maximum * 1e3)
         );
         self.set(
             KEY,
@@ -340,13 +344,13 @@ impl<'a> Draft<'a> {
         let time = number(self.seconds.len() as u64);
         let silences = published.filter_map(|second| second.silence).map(f64::from);
         let Some(Summary { maximum, .. }) = Summary::of(silences) else {
-            return self.leave_out(KEY, "no message was seen");
+            return self.omit(KEY, "no message was seen");
         };
-        let seen = format!("longest silence {} s", short(maximum));
+        let seen = format!("longest silence {} s", three_digits(maximum));
         let is_regular = self.values.min_rate_hz.is_some();
         if !is_regular && maximum > SILENCE_PART * time {
             let why = format!("{} messages, {seen}: too irregular", self.messages);
-            return self.leave_out(KEY, why);
+            return self.omit(KEY, why);
         }
         let due = self.values.min_rate_hz.map_or(0.0, |rate| 5.0 / rate);
         let silence = rounded_up(SHORTEST_SILENCE.max(SILENCE_MARGIN * maximum).max(due));
@@ -360,8 +364,8 @@ impl<'a> Draft<'a> {
     }
 
     fn endpoints(&mut self) {
-        let settled = self.settled();
-        let publishers = self.least(
+        let settled = self.evaluated_seconds();
+        let publishers = self.choose_min_endpoints(
             "publishers",
             &settled,
             |it| it.publishers,
@@ -370,7 +374,7 @@ impl<'a> Draft<'a> {
                 ..ExpectationValues::default()
             },
         );
-        let subscribers = self.least(
+        let subscribers = self.choose_min_endpoints(
             "subscribers",
             &settled,
             |it| it.subscriptions,
@@ -383,7 +387,7 @@ impl<'a> Draft<'a> {
     }
 
     /// Returns the seconds in which the agent evaluates the numbers of endpoints.
-    fn settled(&self) -> Vec<Second> {
+    fn evaluated_seconds(&self) -> Vec<Second> {
         let mut published = 0;
         let mut settled = Vec::new();
         for second in self.seconds {
@@ -392,7 +396,7 @@ impl<'a> Draft<'a> {
             } else {
                 0
             };
-            if published > GRACE {
+            if published > STARTUP_GRACE_SECONDS {
                 settled.push(*second);
             }
         }
@@ -400,16 +404,16 @@ impl<'a> Draft<'a> {
     }
 
     /// Chooses a minimum number of endpoints: the median, or the smallest observed number.
-    fn least(
+    fn choose_min_endpoints(
         &mut self,
         key: &'static str,
         settled: &[Second],
         count: fn(&Second) -> u16,
         expecting: fn(Option<u32>) -> ExpectationValues,
     ) -> Option<u32> {
-        if settled.len() < LEAST {
+        if settled.len() < MIN_OBSERVATIONS {
             let published = self.seconds.iter().filter(|it| it.publishers > 0).count();
-            self.leave_out(key, format!("{published} s with a publisher are too few"));
+            self.omit(key, format!("{published} s with a publisher are too few"));
             return None;
         }
         let mut counts: Vec<u16> = settled.iter().map(count).collect();
@@ -434,7 +438,7 @@ impl<'a> Draft<'a> {
 
     /// Leaves out expectations that the topic's own seconds violate together: bad seconds of
     /// different expectations in a row count as one violation.
-    fn reconcile(&mut self) {
+    fn drop_conflicting(&mut self) {
         let Ok(expectations) = Expectations::try_from(self.values) else {
             return;
         };
@@ -468,26 +472,32 @@ impl<'a> Draft<'a> {
     fn set(&mut self, key: &'static str, value: Option<f64>, seen: String, why: &str) {
         match value {
             Some(value) => self.remarks.push(Remark::Set(key, value, seen)),
-            None => self.leave_out(key, why),
+            None => self.omit(key, why),
         }
     }
 }
 
 impl Windows {
     /// Returns the usual minimum rate, and the widest one, just below the lowest observed rate.
-    fn lows(&self) -> [f64; 2] {
-        let lows = [self.rates.median - self.half(), self.rates.minimum * 0.95];
+    fn min_rates(&self) -> [f64; 2] {
+        let lows = [
+            self.rates.median - self.half_band_width(),
+            self.rates.minimum * 0.95,
+        ];
         lows.map(rounded_down)
     }
 
     /// Returns the usual maximum rate, and the widest one, just above the highest observed rate.
-    fn highs(&self) -> [f64; 2] {
-        let highs = [self.rates.median + self.half(), self.rates.maximum * 1.05];
+    fn max_rates(&self) -> [f64; 2] {
+        let highs = [
+            self.rates.median + self.half_band_width(),
+            self.rates.maximum * 1.05,
+        ];
         highs.map(rounded_up)
     }
 
     /// Returns half the width of the usual band.
-    fn half(&self) -> f64 {
+    fn half_band_width(&self) -> f64 {
         let rates = &self.rates;
         (RATE_MARGIN * rates.median).max(RATE_DEVIATIONS * rates.deviation)
     }
@@ -495,20 +505,20 @@ impl Windows {
     /// Returns the smallest minimum rate that half the rate violates.
     fn least(&self) -> f64 {
         let median = self.rates.median;
-        let half = 0.5 * median + TOLERANCE / number(self.seconds);
+        let half = 0.5 * median + MESSAGE_TOLERANCE / number(self.seconds);
         half.max(RATE_LIMITS.0 * median)
     }
 
     /// Returns whether no window violates this minimum rate.
     fn is_above(&self, rate: f64) -> bool {
         let seconds = number(self.seconds);
-        rate * seconds < self.rates.minimum * seconds + TOLERANCE
+        rate * seconds < self.rates.minimum * seconds + MESSAGE_TOLERANCE
     }
 
     /// Returns whether no window violates this maximum rate.
     fn is_below(&self, rate: f64) -> bool {
         let seconds = number(self.seconds);
-        rate * seconds + TOLERANCE > self.rates.maximum * seconds
+        rate * seconds + MESSAGE_TOLERANCE > self.rates.maximum * seconds
     }
 
     /// Returns the expectation of these rates in windows of this length.
@@ -524,7 +534,7 @@ impl Windows {
 }
 
 /// Returns a statistic as text with three digits.
-fn short(value: f64) -> String {
+fn three_digits(value: f64) -> String {
     if value <= 0.0 {
         return "0".to_owned();
     }

@@ -4,15 +4,16 @@ use std::fmt::Write as _;
 
 use super::Learnt;
 use super::thresholds::{
-    LATENCY_DEVIATIONS, LEAST_LOSS, Lesson, RATE_DEVIATIONS, RATE_MARGIN, Remark, SILENCE_MARGIN,
+    LATENCY_DEVIATIONS, LEAST_LOSS, RATE_DEVIATIONS, RATE_MARGIN, Remark, SILENCE_MARGIN,
+    TopicThresholds,
 };
 use ros2probe_api::parameters::Parameters;
 use ros2probe_daemon::config::MAX_PARAMETERS;
-use ros2probe_daemon::config::rehearsal::GRACE;
+use ros2probe_daemon::config::rehearsal::STARTUP_GRACE_SECONDS;
 use ros2probe_daemon::escape::visible;
 
 /// Column at which reasons begin.
-const COLUMN: usize = 28;
+const REASON_COLUMN: usize = 28;
 /// Maximum size of a configuration file that an agent reads, in bytes.
 const MAX_BYTES: usize = 1 << 20;
 
@@ -104,7 +105,7 @@ pub fn parameters(known: &Parameters<'_>, domain_id: u32) -> String {
 
 /// Returns whether a topic has any expectation.
 #[must_use]
-pub fn is_expected(lesson: &Lesson) -> bool {
+pub fn is_expected(lesson: &TopicThresholds) -> bool {
     let mut remarks = lesson.remarks.iter();
     remarks.any(|remark| matches!(remark, Remark::Set(..)))
 }
@@ -132,14 +133,14 @@ fn head(source: &Source<'_>) -> String {
 # max_latency_ms: median of one-second means with {LATENCY_DEVIATIONS} deviations or 5 ms, at least twice
 #   the 95th percentile
 # max_silence_s: {SILENCE_MARGIN} times the longest silence, at least 2 s and five messages
-# publishers, subscribers: median of the numbers, from {GRACE} s after the first publisher on
+# publishers, subscribers: median of the numbers, from {STARTUP_GRACE_SECONDS} s after the first publisher on
 # A value that the robot itself would have violated is widened to the extreme that was seen. One
 # that is then too wide to find a fault is left out.
 "
     )
 }
 
-fn entry(text: &mut String, lesson: &Lesson, source: &Source<'_>, is_explained: bool) {
+fn entry(text: &mut String, lesson: &TopicThresholds, source: &Source<'_>, is_explained: bool) {
     let name = &lesson.topic;
     if is_expected(lesson) {
         line(text, &format!("  - topic: {name}"));
@@ -156,7 +157,10 @@ fn entry(text: &mut String, lesson: &Lesson, source: &Source<'_>, is_explained: 
             }
             Remark::Set(key, value, why) => {
                 let setting = format!("    {key}: {value}");
-                line(text, &format!("{setting:COLUMN$}  # {}", visible(why)));
+                line(
+                    text,
+                    &format!("{setting:REASON_COLUMN$}  # {}", visible(why)),
+                );
             }
             Remark::LeftOut(..) if !is_explained => {}
             Remark::LeftOut(keys, why) => {

@@ -10,14 +10,14 @@ use ros2probe_api::nodes::Named;
 use ros2probe_api::topics::Topic;
 
 /// Suffix of the feedback topic's name.
-const FEEDBACK: &str = "/_action/feedback";
+const FEEDBACK_TOPIC_SUFFIX: &str = "/_action/feedback";
 /// Suffix of the feedback topic's type.
-const MESSAGE: &str = "_FeedbackMessage";
+const FEEDBACK_TYPE_SUFFIX: &str = "_FeedbackMessage";
 
 /// Returns the name of an action's feedback topic.
 #[must_use]
 pub fn feedback_of(name: &str) -> String {
-    format!("{name}{FEEDBACK}")
+    format!("{name}{FEEDBACK_TOPIC_SUFFIX}")
 }
 
 /// Returns the actions among topics, including hidden ones.
@@ -35,8 +35,10 @@ pub(super) fn of_feedback(topics: &[Named<'_>]) -> Vec<Named<'static>> {
 }
 
 fn of_name(name: &str, types: &[Cow<'_, str>]) -> Option<Named<'static>> {
-    let name = name.strip_suffix(FEEDBACK)?.to_owned();
-    let types = types.iter().filter_map(|each| each.strip_suffix(MESSAGE));
+    let name = name.strip_suffix(FEEDBACK_TOPIC_SUFFIX)?.to_owned();
+    let types = types
+        .iter()
+        .filter_map(|each| each.strip_suffix(FEEDBACK_TYPE_SUFFIX));
     let types: Vec<_> = types.map(|each| Cow::Owned(each.to_owned())).collect();
     (!types.is_empty()).then_some(Named { name, types })
 }
@@ -95,7 +97,7 @@ fn nodes<'a>(endpoints: &'a [Endpoint<'_>]) -> Vec<(&'a str, Vec<&'a str>)> {
     for endpoint in endpoints {
         let (Some(node), Some(kind)) = (
             endpoint.node.as_deref(),
-            endpoint.message_type.strip_suffix(MESSAGE),
+            endpoint.message_type.strip_suffix(FEEDBACK_TYPE_SUFFIX),
         ) else {
             continue;
         };

@@ -29,7 +29,7 @@ pub fn info(bag: &Bag, dialect: Dialect, sort: Sort, details: Option<&Details>) 
     let parts = Parts::of(&metadata.topics, dialect, sort);
     let mut text = "\n".to_owned();
     let mut line = |label: &str, value: &dyn std::fmt::Display| {
-        let _ = writeln!(text, "{label:<LABEL$}{value}");
+        let _ = writeln!(text, "{label:<VALUE_COLUMN$}{value}");
     };
     let files = metadata.relative_file_paths.iter();
     let files: Vec<String> = files.map(|file| visible(file).into_owned()).collect();
@@ -56,7 +56,9 @@ pub fn info(bag: &Bag, dialect: Dialect, sort: Sort, details: Option<&Details>) 
     line("End:", &moment(end, zone));
     line(
         "Messages:",
-        &metadata.message_count.saturating_sub(parts.apart),
+        &metadata
+            .message_count
+            .saturating_sub(parts.of_services_and_actions),
     );
     let topics: Vec<String> = parts
         .topics
@@ -79,7 +81,7 @@ pub fn info(bag: &Bag, dialect: Dialect, sort: Sort, details: Option<&Details>) 
         if parts.services.is_empty() || details.is_some() {
             text.push('\n');
         }
-        let _ = writeln!(text, "{:<LABEL$}{}", "Actions:", parts.actions.len());
+        let _ = writeln!(text, "{:<VALUE_COLUMN$}{}", "Actions:", parts.actions.len());
         text.push_str("Action information: ");
         parts.write_actions(&mut text, details);
     }
@@ -99,9 +101,9 @@ pub fn names(bag: &Bag, dialect: Dialect, sort: Sort) -> String {
 }
 
 /// Column at which values begin.
-const LABEL: usize = 19;
+const VALUE_COLUMN: usize = 19;
 /// Topics of an action, and the suffix that each adds to the action's type.
-const ACTION: [(&str, &str); 5] = [
+const ACTION_TOPICS: [(&str, &str); 5] = [
     ("/_action/feedback", "_FeedbackMessage"),
     ("/_action/status", ""),
     ("/_action/send_goal/_service_event", "_SendGoal_Event"),
@@ -115,15 +117,15 @@ struct Parts<'a> {
     services: Vec<&'a Topic>,
     actions: Vec<Action<'a>>,
     /// Number of messages of services and actions.
-    apart: u64,
+    of_services_and_actions: u64,
 }
 
 struct Action<'a> {
     name: &'a str,
     type_name: String,
     format: &'a str,
-    /// Message counts in the order of [`ACTION`].
-    counts: [u64; ACTION.len()],
+    /// Message counts in the order of [`ACTION_TOPICS`].
+    counts: [u64; ACTION_TOPICS.len()],
 }
 
 impl<'a> Parts<'a> {
@@ -132,14 +134,14 @@ impl<'a> Parts<'a> {
             topics: Vec::new(),
             services: Vec::new(),
             actions: Vec::new(),
-            apart: 0,
+            of_services_and_actions: 0,
         };
         for topic in all {
             let is_event = topic.name.ends_with(SERVICE_EVENT)
                 && topic.type_name.contains("/srv/")
                 && topic.type_name.ends_with("_Event");
             let of_action = || {
-                ACTION
+                ACTION_TOPICS
                     .iter()
                     .position(|(suffix, _)| topic.name.ends_with(suffix))
                     .filter(|_| {
@@ -150,10 +152,14 @@ impl<'a> Parts<'a> {
             if dialect > Dialect::Jazzy
                 && let Some(part) = of_action()
             {
-                parts.apart = parts.apart.saturating_add(topic.message_count);
+                parts.of_services_and_actions = parts
+                    .of_services_and_actions
+                    .saturating_add(topic.message_count);
                 parts.action(topic, part);
             } else if dialect > Dialect::Humble && is_event {
-                parts.apart = parts.apart.saturating_add(topic.message_count);
+                parts.of_services_and_actions = parts
+                    .of_services_and_actions
+                    .saturating_add(topic.message_count);
                 parts.services.push(topic);
             } else {
                 parts.topics.push(topic);
@@ -179,7 +185,7 @@ impl<'a> Parts<'a> {
     }
 
     fn action(&mut self, topic: &'a Topic, part: usize) {
-        let Some((suffix, type_suffix)) = ACTION.get(part) else {
+        let Some((suffix, type_suffix)) = ACTION_TOPICS.get(part) else {
             return;
         };
         let name = topic.name.strip_suffix(suffix).unwrap_or(&topic.name);
@@ -189,7 +195,7 @@ impl<'a> Parts<'a> {
                 name,
                 type_name: String::new(),
                 format: &topic.serialization_format,
-                counts: [0; ACTION.len()],
+                counts: [0; ACTION_TOPICS.len()],
             });
             self.actions.len() - 1
         });
@@ -208,7 +214,7 @@ impl<'a> Parts<'a> {
     fn write_services(&self, text: &mut String, details: Option<&Details>) {
         for (index, topic) in self.services.iter().enumerate() {
             if index > 0 {
-                let _ = write!(text, "{:width$}", "", width = LABEL + 2);
+                let _ = write!(text, "{:width$}", "", width = VALUE_COLUMN + 2);
             }
             let service = topic
                 .name
@@ -240,7 +246,7 @@ impl<'a> Parts<'a> {
 
     fn write_actions(&self, text: &mut String, details: Option<&Details>) {
         for action in &self.actions {
-            let topics = ACTION.map(|(suffix, _)| format!("{}{suffix}", action.name));
+            let topics = ACTION_TOPICS.map(|(suffix, _)| format!("{}{suffix}", action.name));
             let contribution = details.map(|details| {
                 let bytes = topics.iter().map(|topic| details.size(topic)).sum();
                 format!("Size Contribution: {} | ", size(bytes))
@@ -287,7 +293,7 @@ fn topic_line(topic: &Topic, details: Option<&Details>) -> String {
 
 /// Joins lines, indented to the column of values.
 fn lines_of(lines: &[String]) -> String {
-    lines.join(&format!("\n{:LABEL$}", ""))
+    lines.join(&format!("\n{:VALUE_COLUMN$}", ""))
 }
 
 /// Returns a size in the largest unit that keeps the number below 1024.

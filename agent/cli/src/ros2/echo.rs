@@ -21,7 +21,7 @@ use ros2probe_message::{Decoded, Limits, MessageType, Truncation, Value, csv, de
 /// Maximum number of writers whose unreadable messages are counted separately.
 const MAX_WRITERS: usize = 256;
 /// Event types of `service_msgs/msg/ServiceEventInfo`, in the order of its constants.
-const EVENTS: [&str; 4] = [
+const SERVICE_EVENTS: [&str; 4] = [
     "REQUEST_SENT",
     "REQUEST_RECEIVED",
     "RESPONSE_SENT",
@@ -360,7 +360,7 @@ fn info_around(sample: &Sample) -> String {
 
 /// Replaces the first number of an event, its type, by the type's name.
 fn with_name_of_event(document: String) -> String {
-    for (number, name) in EVENTS.iter().enumerate() {
+    for (number, name) in SERVICE_EVENTS.iter().enumerate() {
         let start = format!("info:\n  event_type: {number}\n");
         if let Some(rest) = document.strip_prefix(&start) {
             return format!("info:\n  event_type: {name}\n{rest}");

@@ -8,11 +8,11 @@ use ros2probe_api::endpoints::{Endpoint, Qos};
 use super::Dialect;
 
 /// ros2cli's node name for an endpoint whose participant has not announced its nodes yet.
-const UNKNOWN: [&str; 2] = ["_NODE_NAME_UNKNOWN_", "_NODE_NAMESPACE_UNKNOWN_"];
+const UNKNOWN_NODE: [&str; 2] = ["_NODE_NAME_UNKNOWN_", "_NODE_NAMESPACE_UNKNOWN_"];
 /// ros2cli's node name for an endpoint of a participant without ROS.
-const BARE: [&str; 2] = ["_CREATED_BY_BARE_DDS_APP_"; 2];
+const BARE_DDS_NODE: [&str; 2] = ["_CREATED_BY_BARE_DDS_APP_"; 2];
 /// Trailing zero bytes of a GID in Humble, which is longer than a GUID.
-const PADDING: usize = 8;
+const GID_PADDING: usize = 8;
 
 /// Returns the block without the empty line after it.
 #[must_use]
@@ -41,8 +41,8 @@ fn node<'a>(endpoint: &'a Endpoint<'_>) -> [&'a str; 2] {
             Some((namespace, name)) => [name, namespace],
             None => [node, "/"],
         },
-        (None, Some(_)) => UNKNOWN,
-        (None, None) => BARE,
+        (None, Some(_)) => UNKNOWN_NODE,
+        (None, None) => BARE_DDS_NODE,
     }
 }
 
@@ -56,7 +56,7 @@ fn gid(endpoint: &Endpoint<'_>, dialect: Dialect) -> String {
     let digits: Vec<char> = text.chars().filter(|digit| *digit != '.').collect();
     let mut bytes: Vec<String> = digits.chunks(2).map(|byte| byte.iter().collect()).collect();
     if dialect == Dialect::Humble {
-        bytes.extend(std::iter::repeat_n("00".to_owned(), PADDING));
+        bytes.extend(std::iter::repeat_n("00".to_owned(), GID_PADDING));
     }
     bytes.join(".")
 }
@@ -152,7 +152,7 @@ mod tests {
         };
         assert_eq!(named(Some("/talker"), None), ["talker", "/"]);
         assert_eq!(named(Some("/a/b/talker"), None), ["talker", "/a/b"]);
-        assert_eq!(named(None, Some("/")), UNKNOWN);
-        assert_eq!(named(None, None), BARE);
+        assert_eq!(named(None, Some("/")), UNKNOWN_NODE);
+        assert_eq!(named(None, None), BARE_DDS_NODE);
     }
 }

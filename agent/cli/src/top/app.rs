@@ -8,16 +8,16 @@ use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
 
 use super::Options;
 use super::event_pane::EventPane;
-use super::row::{Column, Key, Past, Row, Standing, shown_name};
-use super::text::safe;
+use super::row::{Column, Key, Past, Row, RowState, shown_name};
+use super::text::escaped;
 use ros2probe_api::events::{Event, Lagged};
 use ros2probe_api::health::Health;
 use ros2probe_api::topics::{TopicDetails, TopicList};
 
 /// Time for which a drop counts as recent.
-const RECENT: Duration = Duration::from_secs(30);
+const RECENT_DROP_TIME: Duration = Duration::from_secs(30);
 /// Time for which the answer to a key stays on the screen.
-const SAID: Duration = Duration::from_secs(8);
+const STATUS_LINE_TIME: Duration = Duration::from_secs(8);
 
 /// Facts received from the agent.
 #[derive(Debug)]
@@ -151,14 +151,14 @@ pub struct App {
     /// State of the agent, and the time of its receipt.
     pub health: Option<(Health, Instant)>,
     /// Start of the agent's silence and its reason, while the agent does not answer.
-    pub gone: Option<(Instant, String)>,
+    pub unreachable_since: Option<(Instant, String)>,
     /// Time of the last topic list.
     pub updated: Option<Instant>,
     /// Time of the last increase of a drop counter.
     dropped_at: Option<Instant>,
     past: HashMap<Key, Past>,
     /// Topics that are measured on behalf of this program.
-    pub holds: BTreeMap<Key, MeasuredBy>,
+    pub measured_topics: BTreeMap<Key, MeasuredBy>,
     status: Option<(Instant, String)>,
 }
 
@@ -210,7 +210,7 @@ impl App {
 
     /// Returns the index of the selected topic in the table; `None` if it is not shown.
     #[must_use]
-    pub fn place_of_selected(&self) -> Option<usize> {
+    pub fn selected_index(&self) -> Option<usize> {
         let selected = self.selected.as_ref()?;
         let mut rows = self.shown();
         rows.position(|row| row.key == *selected)
@@ -220,14 +220,14 @@ impl App {
     #[must_use]
     pub fn status(&self, now: Instant) -> Option<&str> {
         let (at, text) = self.status.as_ref()?;
-        (now.saturating_duration_since(*at) < SAID).then_some(text.as_str())
+        (now.saturating_duration_since(*at) < STATUS_LINE_TIME).then_some(text.as_str())
     }
 
     /// Returns whether the agent dropped data recently.
     #[must_use]
     pub fn is_dropping(&self, now: Instant) -> bool {
         let dropped_at = self.dropped_at;
-        dropped_at.is_some_and(|at| now.saturating_duration_since(at) < RECENT)
+        dropped_at.is_some_and(|at| now.saturating_duration_since(at) < RECENT_DROP_TIME)
     }
 
     /// Returns the age of the topic list; `None` before the first list.
@@ -244,7 +244,7 @@ impl App {
     pub fn take(&mut self, fact: Fact, now: Instant) -> Vec<Command> {
         match fact {
             Fact::Topics(topics) => {
-                (self.updated, self.gone) = (Some(now), None);
+                (self.updated, self.unreachable_since) = (Some(now), None);
                 return self.take_topics(&topics, now);
             }
             Fact::Health(health) => {
@@ -261,25 +261,28 @@ impl App {
             Fact::Event(event) => {
                 let before = self.event_pane.shown().count();
                 self.event_pane.add(&event, self.domain_id);
-                self.stay(before);
+                self.keep_scroll_position(before);
             }
             Fact::Lagged(lagged) => {
                 let before = self.event_pane.shown().count();
                 self.event_pane.lag(&lagged);
-                self.stay(before);
+                self.keep_scroll_position(before);
             }
             Fact::Gone(why) => {
-                let since = self.gone.as_ref().map_or(now, |(since, _)| *since);
-                self.gone = Some((since, safe(&why)));
+                let since = self
+                    .unreachable_since
+                    .as_ref()
+                    .map_or(now, |(since, _)| *since);
+                self.unreachable_since = Some((since, escaped(&why)));
             }
-            Fact::Status(text) => self.status = Some((now, safe(&text))),
-            Fact::Measured(holds) => self.holds = holds,
+            Fact::Status(text) => self.status = Some((now, escaped(&text))),
+            Fact::Measured(holds) => self.measured_topics = holds,
         }
         Vec::new()
     }
 
     /// Keeps the visible lines in place after the user has scrolled back.
-    fn stay(&mut self, before: usize) {
+    fn keep_scroll_position(&mut self, before: usize) {
         if self.events_back > 0 {
             let more = self.event_pane.shown().count().saturating_sub(before);
             self.events_back += more;
@@ -299,20 +302,20 @@ impl App {
             row
         });
         self.rows = rows.collect();
-        self.arrange()
+        self.sort_and_filter()
     }
 
     /// Sorts and filters. The selected topic stays selected. If it no longer exists, the topic at
     /// its position is selected.
-    pub fn arrange(&mut self) -> Vec<Command> {
-        let place = self.place_of_selected().unwrap_or(0);
+    pub fn sort_and_filter(&mut self) -> Vec<Command> {
+        let place = self.selected_index().unwrap_or(0);
         let (sort, reverse) = (self.sort, self.reverse);
         self.rows
             .sort_by(|one, other| sort.order(reverse, one, other));
         let rows = self.rows.iter().enumerate();
         let shown = rows.filter(|(_, row)| self.filter.admits(row));
         self.shown = shown.map(|(at, _)| at).collect();
-        if self.place_of_selected().is_some() {
+        if self.selected_index().is_some() {
             self.scroll();
             return Vec::new();
         }
@@ -337,7 +340,7 @@ impl App {
     /// Scrolls so that the selected topic is visible, given the current [`Heights`].
     pub fn scroll(&mut self) {
         let height = self.heights.topics.max(1);
-        let place = self.place_of_selected().unwrap_or(0);
+        let place = self.selected_index().unwrap_or(0);
         let last = self.shown.len().saturating_sub(height);
         let lowest = place.saturating_sub(height - 1);
         self.offset = self.offset.clamp(lowest, place.max(lowest)).min(last);
@@ -369,22 +372,22 @@ impl App {
             return self.edit(key.code, control);
         }
         match key.code {
-            KeyCode::Char('b') if control => self.go_by(-self.page()),
-            KeyCode::Char('f') if control => self.go_by(self.page()),
-            KeyCode::Char('u') if control => self.go_by(-self.page() / 2),
-            KeyCode::Char('d') if control => self.go_by(self.page() / 2),
+            KeyCode::Char('b') if control => self.move_selection(-self.page()),
+            KeyCode::Char('f') if control => self.move_selection(self.page()),
+            KeyCode::Char('u') if control => self.move_selection(-self.page() / 2),
+            KeyCode::Char('d') if control => self.move_selection(self.page() / 2),
             KeyCode::Char(_) if control => Vec::new(),
             KeyCode::Char('q') => vec![Command::Quit],
             KeyCode::Char('?') | KeyCode::F(1) => {
                 self.help = true;
                 Vec::new()
             }
-            KeyCode::Up | KeyCode::Char('k') => self.go_by(-1),
-            KeyCode::Down | KeyCode::Char('j') => self.go_by(1),
-            KeyCode::PageUp => self.go_by(-self.page()),
-            KeyCode::PageDown | KeyCode::Char(' ') => self.go_by(self.page()),
-            KeyCode::Home | KeyCode::Char('g') => self.go_by(isize::MIN),
-            KeyCode::End | KeyCode::Char('G') => self.go_by(isize::MAX),
+            KeyCode::Up | KeyCode::Char('k') => self.move_selection(-1),
+            KeyCode::Down | KeyCode::Char('j') => self.move_selection(1),
+            KeyCode::PageUp => self.move_selection(-self.page()),
+            KeyCode::PageDown | KeyCode::Char(' ') => self.move_selection(self.page()),
+            KeyCode::Home | KeyCode::Char('g') => self.move_selection(isize::MIN),
+            KeyCode::End | KeyCode::Char('G') => self.move_selection(isize::MAX),
             KeyCode::Char('w' | 'W') => self.measure(key.code),
             code => self.switch(code),
         }
@@ -431,7 +434,7 @@ impl App {
             }
             _ => return Vec::new(),
         }
-        self.arrange()
+        self.sort_and_filter()
     }
 
     fn edit(&mut self, code: KeyCode, control: bool) -> Vec<Command> {
@@ -442,17 +445,17 @@ impl App {
             KeyCode::Char('u') if control => self.filter.text.clear(),
             KeyCode::Char(' '..='~') if control => return Vec::new(),
             KeyCode::Char(character @ ' '..='~') => self.filter.text.push(character),
-            KeyCode::Up => return self.go_by(-1),
-            KeyCode::Down => return self.go_by(1),
+            KeyCode::Up => return self.move_selection(-1),
+            KeyCode::Down => return self.move_selection(1),
             _ => return Vec::new(),
         }
-        self.arrange()
+        self.sort_and_filter()
     }
 
     fn measure(&mut self, code: KeyCode) -> Vec<Command> {
         let selected = self.selected.as_ref();
         let row = self.rows.iter().find(|row| Some(&row.key) == selected);
-        let Some(row) = row.filter(|row| row.standing != Standing::Gone) else {
+        let Some(row) = row.filter(|row| row.state != RowState::Gone) else {
             return Vec::new();
         };
         let (key, name) = (row.key.clone(), row.name.clone());
@@ -513,10 +516,10 @@ impl App {
         isize::try_from(height.saturating_sub(1).max(1)).unwrap_or(1)
     }
 
-    fn go_by(&mut self, steps: isize) -> Vec<Command> {
+    fn move_selection(&mut self, steps: isize) -> Vec<Command> {
         match self.focus {
             Pane::Topics => {
-                let place = self.place_of_selected().unwrap_or(0);
+                let place = self.selected_index().unwrap_or(0);
                 return self.select(place.saturating_add_signed(steps));
             }
             Pane::Details => {

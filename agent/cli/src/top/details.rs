@@ -13,13 +13,13 @@ use ros2probe_api::topics::{ReasonCode, Topic, TopicDetails, Watching};
 use super::event_pane::{shown, shown_list};
 use super::inside;
 use super::row::{is_measured, shown_name};
-use super::text::{beginning, bound, bytes, counted, end, rate, ratio, safe, seconds};
+use super::text::{beginning, bound, bytes, counted, end, escaped, rate, ratio, seconds};
 use super::theme::{Kind, Theme};
 
 /// Maximum number of receivers and destinations without a known reader.
 const MAX_OTHERS: usize = 16;
 /// Width of a node's name, in columns.
-const NODE: usize = 24;
+const NODE_WIDTH: usize = 24;
 
 /// A line and its style.
 pub type Styled = (String, Kind);
@@ -29,7 +29,7 @@ pub type Styled = (String, Kind);
 pub fn lines(details: &TopicDetails<'_>, width: usize, theme: Theme) -> Vec<Styled> {
     let topic = &details.topic;
     let mut lines = Vec::new();
-    let types: Vec<_> = topic.message_types.iter().map(|it| safe(it)).collect();
+    let types: Vec<_> = topic.message_types.iter().map(|it| escaped(it)).collect();
     let head = format!(
         "{}  {}  domain {}",
         shown_name(topic),
@@ -47,7 +47,7 @@ pub fn lines(details: &TopicDetails<'_>, width: usize, theme: Theme) -> Vec<Styl
             inside
                 .late
                 .iter()
-                .map(|late| (inside::late(late), Kind::Problem)),
+                .map(|late| (inside::late_calls_text(late), Kind::Problem)),
         );
     }
     for finding in &topic.diagnoses {
@@ -63,19 +63,22 @@ pub fn lines(details: &TopicDetails<'_>, width: usize, theme: Theme) -> Vec<Styl
             ) => Kind::Plain,
             _ => Kind::Problem,
         };
-        lines.push((format!("why: {}", safe(&reason.detail)), kind));
+        lines.push((format!("why: {}", escaped(&reason.detail)), kind));
     }
     if topic.passages.iter().any(|it| it.passage != "network") {
-        let ways = topic.passages.iter();
-        let ways = ways.map(|it| format!("{} {}", it.pairs, safe(&it.passage)));
-        let ways: Vec<_> = ways.collect();
-        let line = format!("pairs of publisher and subscriber by: {}", ways.join(", "));
+        let ways_text = topic.passages.iter();
+        let ways_text = ways_text.map(|it| format!("{} {}", it.pairs, escaped(&it.passage)));
+        let ways_text: Vec<_> = ways_text.collect();
+        let line = format!(
+            "pairs of publisher and subscriber by: {}",
+            ways_text.join(", ")
+        );
         lines.push((line, Kind::Plain));
     }
     histograms(details, width, theme, &mut lines);
     publishers(topic, theme, &mut lines);
     subscribers(details, theme, &mut lines);
-    others(details, theme, &mut lines);
+    other_receivers(details, theme, &mut lines);
     lines
 }
 
@@ -120,16 +123,16 @@ fn expectation(watch: &Watching<'_>) -> Styled {
         Some("api") => " (added)",
         _ => "",
     };
-    let broken: Vec<_> = watch.violations.iter().map(|it| safe(it)).collect();
+    let broken: Vec<_> = watch.violations.iter().map(|it| escaped(it)).collect();
     let state = match (watch.state.as_ref(), broken.is_empty()) {
-        (state, true) => safe(state),
-        (state, false) => format!("{}: {}", safe(state), broken.join(", ")),
+        (state, true) => escaped(state),
+        (state, false) => format!("{}: {}", escaped(state), broken.join(", ")),
     };
     let is_broken = matches!(watch.state.as_ref(), "violated" | "silent");
     let line = format!(
         "{} matches watch {}{origin}, {}: {state}",
         if is_broken { '!' } else { '-' },
-        safe(&watch.watch),
+        escaped(&watch.watch),
         expected.join(", "),
     );
     (
@@ -199,7 +202,7 @@ fn counts(counted: &Measurement) -> String {
     let mut line = format!(
         "since measurement started: {} of {all} messages, {}",
         counted.messages,
-        bytes(as_real(counted.bytes))
+        bytes(to_f64(counted.bytes))
     );
     let rest = [
         ("lost", counted.lost_messages),
@@ -245,7 +248,7 @@ fn diagnosis(finding: &Finding<'_>, topic: &Topic<'_>) -> String {
         let node = all
             .find(|it| it.guid == guid)
             .and_then(|it| it.node.as_deref());
-        safe(node.unwrap_or(guid))
+        escaped(node.unwrap_or(guid))
     };
     match finding {
         Open::Known(Diagnosis::QosIncompatible {
@@ -266,16 +269,16 @@ fn diagnosis(finding: &Finding<'_>, topic: &Topic<'_>) -> String {
             message_type,
             hashes,
         }) => {
-            let hashes: Vec<_> = hashes.iter().map(|hash| safe(hash)).collect();
-            let message_type = safe(message_type);
+            let hashes: Vec<_> = hashes.iter().map(|hash| escaped(hash)).collect();
+            let message_type = escaped(message_type);
             format!("definitions of {message_type} differ: {}", hashes.join(","))
         }
         Open::Known(Diagnosis::UnmatchedPublisher { writer, reason }) => {
-            let reason = safe(unmatched(reason));
+            let reason = escaped(unmatched(reason));
             format!("{} has no matching subscriber ({reason})", name(writer))
         }
         Open::Known(Diagnosis::UnmatchedSubscription { reader, reason }) => {
-            let reason = safe(unmatched(reason));
+            let reason = escaped(unmatched(reason));
             format!("{} has no matching publisher ({reason})", name(reader))
         }
         Open::Known(Diagnosis::HangingCall { writer }) => {
@@ -283,8 +286,8 @@ fn diagnosis(finding: &Finding<'_>, topic: &Topic<'_>) -> String {
         }
         Open::Known(Diagnosis::RestampingNode { node, input }) => format!(
             "{} replaces the stamps of {}: chains end here",
-            safe(node),
-            safe(input)
+            escaped(node),
+            escaped(input)
         ),
         Open::Known(Diagnosis::BuffersByCpu {
             writer,
@@ -295,20 +298,20 @@ fn diagnosis(finding: &Finding<'_>, topic: &Topic<'_>) -> String {
                 Some(reader) => format!("{} takes no buffers", name(reader)),
                 None => "it is transient local".to_owned(),
             };
-            let (who, backends) = (name(writer), shown_list(backends));
-            format!("{who} sends through the CPU instead of {backends}: {why}")
+            let (writer_name, backends) = (name(writer), shown_list(backends));
+            format!("{writer_name} sends through the CPU instead of {backends}: {why}")
         }
         Open::Known(Diagnosis::SlowChain {
             from,
             max_latency_ms,
         }) => {
-            let from = safe(from);
+            let from = escaped(from);
             format!("the chain from {from} takes longer than {max_latency_ms} ms")
         }
         Open::Known(other) => inside::problem(other).unwrap_or_else(|| other.kind().to_owned()),
         Open::Unknown(attributes) => {
             let all = attributes.0.iter();
-            let all = all.map(|(key, value)| format!("{}={}", safe(key), shown(value)));
+            let all = all.map(|(key, value)| format!("{}={}", escaped(key), shown(value)));
             all.collect::<Vec<_>>().join(" ")
         }
     }
@@ -394,7 +397,7 @@ pub fn bars(buckets: &[Bucket], width: usize, theme: Theme) -> Vec<String> {
             Some(upper) => format!("<= {:>5}", seconds(upper)),
             None => "   more ".to_owned(),
         };
-        let part = as_real(bucket.count) / as_real(most);
+        let part = to_f64(bucket.count) / to_f64(most);
         format!(
             "  {bound} {:>digits$} {}",
             bucket.count,
@@ -410,7 +413,7 @@ fn publishers(topic: &Topic<'_>, theme: Theme, lines: &mut Vec<Styled>) {
     }
     let title = counted(topic.publishers.len() as u64, "publisher");
     let heading = format!(
-        "{title:<NODE$} {:>6} {:>6} {:>6} {:>5} {:>5}  QOS",
+        "{title:<NODE_WIDTH$} {:>6} {:>6} {:>6} {:>5} {:>5}  QOS",
         "HZ", "B/S", "LOST", "MED", "P99"
     );
     lines.push((heading, Kind::Heading));
@@ -419,7 +422,7 @@ fn publishers(topic: &Topic<'_>, theme: Theme, lines: &mut Vec<Styled>) {
         let known = |value: Option<String>| value.unwrap_or_else(|| "-".to_owned());
         let latency = measured.and_then(|it| it.latency);
         let line = format!(
-            "{:<NODE$} {:>6} {:>6} {:>6} {:>5} {:>5}  {}",
+            "{:<NODE_WIDTH$} {:>6} {:>6} {:>6} {:>5} {:>5}  {}",
             node(writer, theme),
             known(measured.and_then(|it| it.rate_hertz).map(rate)),
             known(
@@ -451,7 +454,7 @@ fn subscribers(details: &TopicDetails<'_>, theme: Theme, lines: &mut Vec<Styled>
     }
     let title = counted(topic.subscriptions.len() as u64, "subscriber");
     let heading = format!(
-        "{title:<NODE$} {:>7} {:>6} {:>6}  QOS",
+        "{title:<NODE_WIDTH$} {:>7} {:>6} {:>6}  QOS",
         "CAME", "LOST", "BEHIND"
     );
     lines.push((heading, Kind::Heading));
@@ -472,7 +475,7 @@ fn subscribers(details: &TopicDetails<'_>, theme: Theme, lines: &mut Vec<Styled>
         });
         let known = |value: Option<String>| value.unwrap_or_else(|| "-".to_owned());
         let line = format!(
-            "{:<NODE$} {:>7} {:>6} {:>6}  {}",
+            "{:<NODE_WIDTH$} {:>7} {:>6} {:>6}  {}",
             node(reader, theme),
             known(sum.map(|it| it.messages.to_string())),
             known(sum.map(|it| it.lost_messages.to_string())),
@@ -491,7 +494,7 @@ fn subscribers(details: &TopicDetails<'_>, theme: Theme, lines: &mut Vec<Styled>
 }
 
 /// Adds the lines for receivers without a known reader, and for other destinations.
-fn others(details: &TopicDetails<'_>, theme: Theme, lines: &mut Vec<Styled>) {
+fn other_receivers(details: &TopicDetails<'_>, theme: Theme, lines: &mut Vec<Styled>) {
     let mut others: BTreeMap<String, Delivered> = BTreeMap::new();
     for delivery in &details.deliveries {
         let to = match (delivery.direction.as_ref(), &delivery.process) {
@@ -500,21 +503,24 @@ fn others(details: &TopicDetails<'_>, theme: Theme, lines: &mut Vec<Styled>) {
                 let id = delivery
                     .process_id
                     .map_or_else(String::new, |id| format!(" {id}"));
-                format!("in {}{id}", safe(process))
+                format!("in {}{id}", escaped(process))
             }
-            ("received", None) => format!("at {}", safe(&delivery.destination)),
-            _ => format!("to {}", safe(&delivery.destination)),
+            ("received", None) => format!("at {}", escaped(&delivery.destination)),
+            _ => format!("to {}", escaped(&delivery.destination)),
         };
         add(others.entry(to).or_default(), &delivery.delivered);
     }
     if others.is_empty() {
         return;
     }
-    let heading = format!("{:<NODE$} {:>7} {:>6}", "other ways", "CAME", "LOST");
+    let heading = format!("{:<NODE_WIDTH$} {:>7} {:>6}", "other ways", "CAME", "LOST");
     lines.push((heading, Kind::Heading));
     for (to, it) in others.iter().take(MAX_OTHERS) {
-        let to = beginning(to, NODE, theme.cut());
-        let line = format!("{to:<NODE$} {:>7} {:>6}", it.messages, it.lost_messages);
+        let to = beginning(to, NODE_WIDTH, theme.cut());
+        let line = format!(
+            "{to:<NODE_WIDTH$} {:>7} {:>6}",
+            it.messages, it.lost_messages
+        );
         lines.push((line, Kind::Plain));
     }
     if let Some(more) = others
@@ -537,15 +543,15 @@ fn add(sum: &mut Delivered, one: &Delivered) {
 }
 
 fn node(endpoint: &Endpoint<'_>, theme: Theme) -> String {
-    let name = safe(endpoint.node.as_deref().unwrap_or(&endpoint.guid));
-    end(&name, NODE, theme.cut())
+    let name = escaped(endpoint.node.as_deref().unwrap_or(&endpoint.guid));
+    end(&name, NODE_WIDTH, theme.cut())
 }
 
 fn qos(endpoint: &Endpoint<'_>, topic: &Topic<'_>) -> String {
     let qos = &endpoint.qos;
     let parts = [&qos.reliability, &qos.durability, &qos.history];
     let parts = parts.into_iter().filter(|part| !part.is_empty());
-    let mut parts: Vec<_> = parts.map(|part| safe(part)).collect();
+    let mut parts: Vec<_> = parts.map(|part| escaped(part)).collect();
     if let Some(deadline) = qos.deadline_seconds {
         parts.push(format!("deadline {}", seconds(deadline)));
     }
@@ -553,16 +559,16 @@ fn qos(endpoint: &Endpoint<'_>, topic: &Topic<'_>) -> String {
         endpoint
             .vendor
             .as_deref()
-            .map(|vendor| format!("({})", safe(vendor))),
+            .map(|vendor| format!("({})", escaped(vendor))),
     );
     if topic.message_types.len() > 1 {
-        parts.push(safe(&endpoint.message_type));
+        parts.push(escaped(&endpoint.message_type));
     }
     parts.join(" ")
 }
 
 #[expect(clippy::cast_precision_loss, reason = "counts far below 2^52")]
-fn as_real(count: u64) -> f64 {
+fn to_f64(count: u64) -> f64 {
     count as f64
 }
 

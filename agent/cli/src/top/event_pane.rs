@@ -3,12 +3,12 @@
 use std::borrow::Cow;
 use std::collections::VecDeque;
 
-use super::text::safe;
+use super::text::escaped;
 use ros2probe_api::attributes::Value;
 use ros2probe_api::events::{Event, Lagged};
 
 /// Maximum number of events kept for scrolling.
-const KEPT: usize = 1_000;
+const MAX_EVENTS: usize = 1_000;
 
 /// Line of one event.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -36,8 +36,8 @@ impl EventPane {
         {
             return;
         }
-        let mut text = format!("{} {:<5} ", clock(&event.time), safe(&event.severity));
-        text.push_str(&safe(
+        let mut text = format!("{} {:<5} ", clock(&event.time), escaped(&event.severity));
+        text.push_str(&escaped(
             event.name.strip_prefix("ros2.").unwrap_or(&event.name),
         ));
         let first = ["topic", "ros_node", "what", "watch", "error"];
@@ -64,7 +64,7 @@ impl EventPane {
                 let value = shown(value);
                 let is_skipped = first.contains(&key) || is_noise || value.is_empty();
                 if !is_skipped && last.contains(&key) == is_identity {
-                    text.push_str(&format!(" {}={value}", safe(key)));
+                    text.push_str(&format!(" {}={value}", escaped(key)));
                 }
             }
         }
@@ -94,7 +94,7 @@ impl EventPane {
 
     fn push(&mut self, line: Line) {
         self.lines.push_back(line);
-        if self.lines.len() > KEPT {
+        if self.lines.len() > MAX_EVENTS {
             self.lines.pop_front();
         }
     }
@@ -102,7 +102,7 @@ impl EventPane {
 
 /// Returns the time of day of `2026-11-20T14:02:11.123456789Z`.
 fn clock(time: &str) -> String {
-    let time = safe(time);
+    let time = escaped(time);
     let (_, clock) = time.split_once('T').unwrap_or_default();
     clock.chars().take(8).collect()
 }
@@ -111,7 +111,7 @@ fn clock(time: &str) -> String {
 #[must_use]
 pub fn shown(value: &Value<'_>) -> String {
     match value {
-        Value::Text(text) => safe(text),
+        Value::Text(text) => escaped(text),
         Value::List(texts) => shown_list(texts),
         Value::Number(number) => number.to_string(),
         Value::Real(real) => format!("{real:.3}"),
@@ -122,7 +122,7 @@ pub fn shown(value: &Value<'_>) -> String {
 /// Returns texts separated by commas.
 #[must_use]
 pub fn shown_list(texts: &[Cow<'_, str>]) -> String {
-    let texts: Vec<_> = texts.iter().map(|text| safe(text)).collect();
+    let texts: Vec<_> = texts.iter().map(|text| escaped(text)).collect();
     texts.join(",")
 }
 
@@ -155,7 +155,7 @@ mod tests {
     #[test]
     fn the_pane_keeps_the_latest_events_and_the_number_of_missed_ones() {
         let mut events = EventPane::default();
-        for number in 0..KEPT + 5 {
+        for number in 0..MAX_EVENTS + 5 {
             events.add(
                 &event(json!({"severity": "INFO", "attributes": {"count": number}})),
                 None,
@@ -165,7 +165,7 @@ mod tests {
             missed: Some(7),
             reason: "overwritten".into(),
         });
-        assert_eq!(events.shown().count(), KEPT);
+        assert_eq!(events.shown().count(), MAX_EVENTS);
         events.only_warnings = true;
         let lines: Vec<_> = events.shown().collect();
         assert_eq!(lines.len(), 1);

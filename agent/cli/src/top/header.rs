@@ -2,18 +2,18 @@
 //! must never look healthy.
 
 use ros2probe_api::health::Health;
-use ros2probe_daemon::missed_announcements::{DISCOVER, explanation, sentence};
+use ros2probe_daemon::missed_announcements::{DISCOVER_COMMAND, explanation, sentence};
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
 
 use super::app::App;
 use super::details::Styled;
-use super::row::Standing;
-use super::text::{counted, safe};
+use super::row::RowState;
+use super::text::{counted, escaped};
 use super::theme::{Kind, Theme};
 
 /// Age above which the table is stale, as in the agent itself.
-const FRESH: Duration = Duration::from_secs(5);
+const STALE_AGE: Duration = Duration::from_secs(5);
 
 /// Returns at most `most` lines. With a `width` of 0, lines are as wide as their text.
 #[must_use]
@@ -42,7 +42,7 @@ fn robot(app: &App, width: usize, now: Instant) -> String {
         .as_ref()
         .filter(|(health, _)| health.source != "replay")
         .and_then(|(health, _)| health.host.clone());
-    let host = safe(&host.unwrap_or_else(|| app.place.clone()));
+    let host = escaped(&host.unwrap_or_else(|| app.place.clone()));
     let domains: BTreeSet<_> = app.rows().iter().map(|row| row.key.domain_id).collect();
     let domains = match (app.domain_id, domains.len()) {
         (Some(domain_id), _) => format!("domain {domain_id}"),
@@ -72,7 +72,7 @@ fn robot(app: &App, width: usize, now: Instant) -> String {
     let age = match app.age(now).map(|age| age.as_secs_f64()) {
         None => "no data".to_owned(),
         // No data is newer than the end of a capture.
-        Some(_) if is_over && app.gone.is_none() => "at its end".to_owned(),
+        Some(_) if is_over && app.unreachable_since.is_none() => "at its end".to_owned(),
         Some(age) if age >= 100.0 => format!("{age:.0} s old"),
         Some(age) => format!("{age:.1} s old"),
     };
@@ -88,7 +88,7 @@ fn robot(app: &App, width: usize, now: Instant) -> String {
 
 /// Returns the line about the agent, and about the table's sorting and filter.
 fn agent(app: &App) -> String {
-    let state = match (&app.health, &app.gone) {
+    let state = match (&app.health, &app.unreachable_since) {
         (_, Some(_)) => "AGENT GONE".to_owned(),
         (None, None) => "waiting for the agent".to_owned(),
         (Some((health, _)), None) if !health.ready => "AGENT NOT READY".to_owned(),
@@ -116,7 +116,7 @@ fn agent(app: &App) -> String {
             only.push("measured".to_owned());
         }
         if !app.filter.text.is_empty() {
-            only.push(format!("\"{}\"", safe(&app.filter.text)));
+            only.push(format!("\"{}\"", escaped(&app.filter.text)));
         }
         line.push_str(&format!(
             "; only {}: {} shown",
@@ -148,15 +148,15 @@ fn dropped(health: &Health) -> String {
 fn warnings(app: &App, now: Instant) -> Vec<Styled> {
     let mut warnings = Vec::new();
     let mut warn = |text: String| warnings.push((format!("! {text}"), Kind::Problem));
-    if let Some((since, why)) = &app.gone {
+    if let Some((since, why)) = &app.unreachable_since {
         let since = now.saturating_duration_since(*since).as_secs();
         warn(format!("agent unreachable for {since} s, retrying: {why}"));
     }
-    if let Some(age) = app.age(now).filter(|age| *age > FRESH)
+    if let Some(age) = app.age(now).filter(|age| *age > STALE_AGE)
         && !app
             .health
             .as_ref()
-            .is_some_and(|(health, _)| health.finished && app.gone.is_none())
+            .is_some_and(|(health, _)| health.finished && app.unreachable_since.is_none())
     {
         warn(format!("the data shown is {} s old", age.as_secs()));
     }
@@ -165,7 +165,10 @@ fn warnings(app: &App, now: Instant) -> Vec<Styled> {
     };
     if !health.ready {
         let why = health.reason.as_deref().unwrap_or("it gives no reason");
-        warn(format!("the agent does not see the robot: {}", safe(why)));
+        warn(format!(
+            "the agent does not see the robot: {}",
+            escaped(why)
+        ));
     }
     if health.dropped() > 0 {
         let when = if app.is_dropping(now) {
@@ -181,7 +184,7 @@ fn warnings(app: &App, now: Instant) -> Vec<Styled> {
     let unseen = app
         .rows()
         .iter()
-        .filter(|row| row.standing == Standing::Unseen);
+        .filter(|row| row.state == RowState::Unseen);
     let unseen = unseen.count() as u64;
     if unseen > 0 {
         warn(format!(
@@ -191,28 +194,31 @@ fn warnings(app: &App, now: Instant) -> Vec<Styled> {
     }
     if health.unknown_writers > 0 {
         let remedy = health.unknown_writers_remedy.as_deref();
-        let (what, remedy) = (sentence(health.unknown_writers), remedy.unwrap_or(DISCOVER));
-        warn(format!("{what}: {}", explanation(&safe(remedy))));
+        let (what, remedy) = (
+            sentence(health.unknown_writers),
+            remedy.unwrap_or(DISCOVER_COMMAND),
+        );
+        warn(format!("{what}: {}", explanation(&escaped(remedy))));
     }
     if health.topics_rejected > 0 {
         let topics = counted(health.topics_rejected, "watched topic");
         warn(format!("{topics} not measured: limits.topics is reached"));
     }
     for table in health.tables.iter().filter(|table| table.evictions > 0) {
-        let (count, name) = (table.evictions, safe(&table.table));
+        let (count, name) = (table.evictions, escaped(&table.table));
         warn(format!(
             "the table of {name} is full: {count} evicted (limits)"
         ));
     }
     if let Some(reason) = &health.source_reason {
-        warn(format!("sees less than it could: {}", safe(reason)));
+        warn(format!("sees less than it could: {}", escaped(reason)));
     }
     for blind in health.abilities.iter().filter(|ability| !ability.able) {
         if let Some(reason) = &blind.reason {
             warn(format!(
                 "blind for {}: {}",
-                safe(&blind.ability),
-                safe(reason)
+                escaped(&blind.ability),
+                escaped(reason)
             ));
         }
     }

@@ -5,22 +5,22 @@ use std::borrow::Cow;
 use ros2probe_api::diagnosis::Diagnosis;
 use ros2probe_api::inside::{RecentLateCalls, TopicInside};
 
-use super::text::{counted, ratio, safe, seconds};
+use super::text::{counted, escaped, ratio, seconds};
 
 /// Returns the late calls of a topic's callbacks, as text.
-pub(super) fn late(late: &RecentLateCalls<'_>) -> String {
+pub(super) fn late_calls_text(late: &RecentLateCalls<'_>) -> String {
     format!(
         "{} in the last minute, up to {}: {} (rp why)",
         counted(late.calls, "late call"),
         seconds(late.longest_seconds),
-        safe(&late.words)
+        escaped(&late.words)
     )
 }
 
 /// Returns the text of a problem that only calls inside processes show; `None` for any other.
 pub(super) fn problem(diagnosis: &Diagnosis<'_>) -> Option<String> {
-    let who = |node: &Option<Cow<'_, str>>, process: &u32| match node {
-        Some(node) => safe(node),
+    let node_or_process = |node: &Option<Cow<'_, str>>, process: &u32| match node {
+        Some(node) => escaped(node),
         None => format!("process {process}"),
     };
     Some(match diagnosis {
@@ -33,8 +33,8 @@ pub(super) fn problem(diagnosis: &Diagnosis<'_>) -> Option<String> {
             own_period,
         } => format!(
             "callback of {} in {} takes {}, {} is {}",
-            safe(&trigger.words()),
-            who(node, process_id),
+            escaped(&trigger.words()),
+            node_or_process(node, process_id),
             seconds(*duration_seconds),
             match own_period {
                 true => "its period",
@@ -49,8 +49,8 @@ pub(super) fn problem(diagnosis: &Diagnosis<'_>) -> Option<String> {
             wait_seconds,
         } => format!(
             "callback of {} in {} waits {} for the executor",
-            safe(&trigger.words()),
-            who(node, process_id),
+            escaped(&trigger.words()),
+            node_or_process(node, process_id),
             seconds(*wait_seconds)
         ),
         Diagnosis::LateCallback {
@@ -63,10 +63,10 @@ pub(super) fn problem(diagnosis: &Diagnosis<'_>) -> Option<String> {
             ..
         } => format!(
             "callback of {} in {} was late {late_calls} times in a minute, up to {}: {}",
-            safe(&trigger.words()),
-            who(node, process_id),
+            escaped(&trigger.words()),
+            node_or_process(node, process_id),
             seconds(*longest_seconds),
-            safe(words)
+            escaped(words)
         ),
         Diagnosis::IntraProcessOverflow {
             node,
@@ -74,7 +74,7 @@ pub(super) fn problem(diagnosis: &Diagnosis<'_>) -> Option<String> {
             overwritten_ratio,
         } => format!(
             "{} within the process overwrites {} of the messages",
-            who(node, process_id),
+            node_or_process(node, process_id),
             ratio(*overwritten_ratio)
         ),
         Diagnosis::ReaderQueueOverflow {
@@ -84,7 +84,7 @@ pub(super) fn problem(diagnosis: &Diagnosis<'_>) -> Option<String> {
             ..
         } => format!(
             "{} takes too slowly: its queue loses {} of the messages",
-            who(node, process_id),
+            node_or_process(node, process_id),
             ratio(*lost_ratio)
         ),
         Diagnosis::ObservationSuspended { process_id, .. } => {

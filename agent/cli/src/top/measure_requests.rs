@@ -19,7 +19,7 @@ use ros2probe_api::watches::{Watch, WatchRequest};
 /// Interval at which a connection checks whether it is still needed.
 const POLL_INTERVAL: Duration = Duration::from_millis(200);
 /// Number of checks between two attempts to reopen a connection.
-const PAUSE: u32 = 10;
+const REOPEN_CHECKS: u32 = 10;
 
 /// All topics measured on behalf of this program.
 #[derive(Debug)]
@@ -103,7 +103,7 @@ impl MeasureRequests {
     }
 
     /// Removes a topic whose connection failed. Returns the status line.
-    pub(super) fn lost(&mut self, key: &Key, why: String) -> String {
+    pub(super) fn remove_failed(&mut self, key: &Key, why: String) -> String {
         self.all.remove(key);
         why
     }
@@ -151,7 +151,7 @@ impl Stream {
                         }
                     }
                 }
-                Err(error @ (ClientError::Refused(_) | ClientError::Older { .. })) => {
+                Err(error @ (ClientError::Refused(_) | ClientError::OlderAgent { .. })) => {
                     let _ = self
                         .requests
                         .send(Request::Lost(self.key, error.to_string()));
@@ -159,7 +159,7 @@ impl Stream {
                 }
                 Err(_) => {}
             }
-            for _ in 0..PAUSE {
+            for _ in 0..REOPEN_CHECKS {
                 if self.is_over() {
                     return;
                 }

@@ -33,9 +33,9 @@ use terminal::Screen;
 use theme::Theme;
 
 /// Maximum time between two drawings, which update the shown age.
-const TICK: Duration = Duration::from_millis(500);
+const MAX_REDRAW_INTERVAL: Duration = Duration::from_millis(500);
 /// Minimum time between two drawings caused by facts. Keys redraw immediately.
-const CALM: Duration = Duration::from_millis(100);
+const MIN_REDRAW_INTERVAL: Duration = Duration::from_millis(100);
 /// Maximum number of keys and facts that wait for a slow terminal. Senders block beyond it.
 const MAX_WAITING: usize = 64;
 /// Maximum number of header lines in text without scrolling.
@@ -64,7 +64,7 @@ pub struct Options {
 ///
 /// Fails if the agent is unreachable or refuses.
 pub fn once(agent: &Agent, options: &Options) -> Result<String, ClientError> {
-    let (health, topics) = poller::ask(agent, options.domain_id, options.hidden)?;
+    let (health, topics) = poller::request(agent, options.domain_id, options.hidden)?;
     let (mut app, now) = (App::new(options, agent.place()), Instant::now());
     app.take(Fact::Health(Box::new(health)), now);
     app.take(Fact::Topics(Box::new(topics)), now);
@@ -115,7 +115,11 @@ fn handle_input(app: &mut App, poller: &Poller, input: &Receiver<Input>) -> Opti
     let begun = Instant::now();
     let mut is_changed = false;
     loop {
-        let timeout = if is_changed { CALM } else { TICK };
+        let timeout = if is_changed {
+            MIN_REDRAW_INTERVAL
+        } else {
+            MAX_REDRAW_INTERVAL
+        };
         let next = match input.recv_timeout(timeout.saturating_sub(begun.elapsed())) {
             Ok(next) => next,
             Err(RecvTimeoutError::Timeout) => return None,

@@ -13,7 +13,7 @@ use super::app::{Command, Fact};
 use super::measure_requests::MeasureRequests;
 use super::row::Key;
 use super::server_sent::Messages;
-use super::text::safe;
+use super::text::escaped;
 use crate::client::{Agent, ClientError};
 use ros2probe_api::events::{Event, Lagged};
 use ros2probe_api::health::Health;
@@ -58,7 +58,7 @@ struct Poll {
     interval: Duration,
     hidden: bool,
     selected: Option<Key>,
-    holds: MeasureRequests,
+    measure_requests: MeasureRequests,
     inputs: SyncSender<Input>,
 }
 
@@ -82,7 +82,7 @@ impl Poller {
             interval,
             hidden: false,
             selected: None,
-            holds: MeasureRequests::new(Arc::clone(&agent), requests.clone()),
+            measure_requests: MeasureRequests::new(Arc::clone(&agent), requests.clone()),
             inputs: inputs.clone(),
         };
         let thread = thread::Builder::new().name("poll".to_owned());
@@ -105,7 +105,7 @@ impl Poller {
 /// # Errors
 ///
 /// Fails if the agent is unreachable or refuses.
-pub fn ask(
+pub fn request(
     agent: &Agent,
     domain_id: Option<u32>,
     hidden: bool,
@@ -128,7 +128,7 @@ impl Poll {
                 match asked.recv_timeout(left) {
                     Ok(Request::Command(command)) => self.execute(command),
                     Ok(Request::Lost(key, why)) => {
-                        let status = self.holds.lost(&key, why);
+                        let status = self.measure_requests.remove_failed(&key, why);
                         self.send_measured(status);
                     }
                     Err(RecvTimeoutError::Timeout) => break,
@@ -139,7 +139,7 @@ impl Poll {
     }
 
     fn all(&mut self) {
-        match ask(&self.agent, self.domain_id, self.hidden) {
+        match request(&self.agent, self.domain_id, self.hidden) {
             Ok((health, topics)) => {
                 self.send(Fact::Health(Box::new(health)));
                 self.send(Fact::Topics(Box::new(topics)));
@@ -178,18 +178,18 @@ impl Poll {
                 self.all();
             }
             Command::Toggle(key, name) => {
-                let status = self.holds.toggle(&key, &name);
+                let status = self.measure_requests.toggle(&key, &name);
                 self.send_measured(status);
             }
             Command::Keep(key, name) => {
-                let status = self.holds.keep(&key, &name);
+                let status = self.measure_requests.keep(&key, &name);
                 self.send_measured(status);
             }
         }
     }
 
     fn send_measured(&self, status: String) {
-        self.send(Fact::Measured(self.holds.shown()));
+        self.send(Fact::Measured(self.measure_requests.shown()));
         self.send(Fact::Status(status));
     }
 
@@ -238,7 +238,7 @@ fn fact(event: &str, data: &str) -> Option<Fact> {
     let read = serde_json::from_str::<Event<'_>>(data).or_else(|_| {
         // Unknown events are shown rather than dropped.
         serde_json::from_str::<Value>(data).map(|_| Event {
-            name: safe(event).into(),
+            name: escaped(event).into(),
             ..Event::default()
         })
     });

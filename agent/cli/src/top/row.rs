@@ -5,14 +5,14 @@ use std::cmp::Ordering;
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
-use super::text::safe;
+use super::text::escaped;
 use ros2probe_api::Open;
 use ros2probe_api::topics::{ReasonCode, Topic};
 
 /// Time span of losses in the table, so that an old loss does not hide a new one.
-const WINDOW: Duration = Duration::from_secs(30);
+const LOSS_WINDOW: Duration = Duration::from_secs(30);
 /// Minimum time between two samples of the counters.
-const STEP: Duration = Duration::from_millis(900);
+const SAMPLE_INTERVAL: Duration = Duration::from_millis(900);
 
 /// Identity of a topic within all domains.
 #[derive(Clone, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -25,7 +25,7 @@ pub struct Key {
 
 /// State of a topic, from worst to best.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Standing {
+pub enum RowState {
     /// An expectation is violated.
     Violated,
     /// The topic is published, but has no messages.
@@ -46,7 +46,7 @@ pub enum Standing {
     Gone,
 }
 
-impl Standing {
+impl RowState {
     /// Returns the label in the table.
     #[must_use]
     pub const fn label(self) -> &'static str {
@@ -78,7 +78,7 @@ pub struct Row {
     /// Messages per second.
     pub rate: Option<f64>,
     /// Minimum and maximum expected rate, in messages per second.
-    pub wanted: (Option<f64>, Option<f64>),
+    pub expected_rate: (Option<f64>, Option<f64>),
     /// Payload bytes per second.
     pub bandwidth: Option<f64>,
     /// Ratio of messages that the worst subscriber lost.
@@ -94,7 +94,7 @@ pub struct Row {
     /// Number of readers.
     pub subscriptions: usize,
     /// State of the topic.
-    pub standing: Standing,
+    pub state: RowState,
     /// Problems, in one word each.
     pub problems: Vec<&'static str>,
 }
@@ -106,24 +106,31 @@ struct Counters {
     lost: u64,
 }
 
-/// Counters of the last [`WINDOW`].
+/// Counters of the last [`LOSS_WINDOW`].
 #[derive(Clone, Debug, Default)]
 pub struct Past {
     notes: VecDeque<(Instant, Counters)>,
 }
 
 impl Past {
-    /// Returns the loss ratio of the last [`WINDOW`], or the total one if nothing was sent in it.
-    /// The flag is whether messages were lost in the window.
+    /// Returns the loss ratio of the last [`LOSS_WINDOW`], or the total one if nothing was sent in
+    /// it. The flag is whether messages were lost in the window.
     fn loss(&mut self, topic: &Topic<'_>, now: Instant) -> (Option<f64>, bool) {
         let latest = Counters::of(topic);
         let first = self.notes.front().map(|(_, counters)| *counters);
         let lately = first.and_then(|first| latest.since(first));
         let is_lost = lately.is_some_and(|(_, lost)| lost);
-        let is_due = self.notes.back().is_none_or(|(at, _)| now - *at >= STEP);
+        let is_due = self
+            .notes
+            .back()
+            .is_none_or(|(at, _)| now - *at >= SAMPLE_INTERVAL);
         if is_due {
             self.notes.push_back((now, latest));
-            while self.notes.front().is_some_and(|(at, _)| now - *at > WINDOW) {
+            while self
+                .notes
+                .front()
+                .is_some_and(|(at, _)| now - *at > LOSS_WINDOW)
+            {
                 self.notes.pop_front();
             }
         }
@@ -169,8 +176,8 @@ impl Row {
             None => (None, false),
         };
         let latency = measured.and_then(|it| it.latency.or(it.header_latency));
-        let standing = standing(topic, is_measured);
-        let types: Vec<_> = topic.message_types.iter().map(|it| safe(it)).collect();
+        let standing = row_state(topic, is_measured);
+        let types: Vec<_> = topic.message_types.iter().map(|it| escaped(it)).collect();
         Self {
             key: Key {
                 domain_id: topic.domain_id,
@@ -180,7 +187,7 @@ impl Row {
             message_type: types.join(", "),
             is_measured,
             rate: measured.and_then(|it| it.rate_hertz),
-            wanted: wanted(topic),
+            expected_rate: expected_rate(topic),
             bandwidth: measured.and_then(|it| it.bandwidth_bytes_per_second),
             loss,
             median: latency.map(|it| it.p50_seconds),
@@ -191,7 +198,7 @@ impl Row {
                 .and_then(|inside| Some(inside.late.as_ref()?.calls)),
             publishers: topic.publishers.len(),
             subscriptions: topic.subscriptions.len(),
-            standing,
+            state: standing,
             problems: problems(topic, standing, is_losing),
         }
     }
@@ -200,10 +207,10 @@ impl Row {
     #[must_use]
     pub fn state(&self) -> String {
         if self.problems.is_empty() {
-            return self.standing.label().to_owned();
+            return self.state.label().to_owned();
         }
-        let says_more = matches!(self.standing, Standing::Unwatched | Standing::NoSubscriber);
-        let standing = says_more.then(|| self.standing.label());
+        let says_more = matches!(self.state, RowState::Unwatched | RowState::NoSubscriber);
+        let standing = says_more.then(|| self.state.label());
         let words = self.problems.iter().copied().chain(standing);
         format!("!{}", words.collect::<Vec<_>>().join(","))
     }
@@ -213,8 +220,8 @@ impl Row {
 #[must_use]
 pub fn shown_name(topic: &Topic<'_>) -> String {
     match topic.kind.as_ref() {
-        "service_request" | "service_reply" => safe(&topic.dds_name),
-        _ => safe(&topic.name),
+        "service_request" | "service_reply" => escaped(&topic.dds_name),
+        _ => escaped(&topic.name),
     }
 }
 
@@ -227,7 +234,7 @@ pub fn is_measured(topic: &Topic<'_>) -> bool {
 }
 
 /// Returns the tightest of all expectations about the topic's rate.
-fn wanted(topic: &Topic<'_>) -> (Option<f64>, Option<f64>) {
+fn expected_rate(topic: &Topic<'_>) -> (Option<f64>, Option<f64>) {
     let watches = || topic.watches.iter();
     (
         watches()
@@ -239,9 +246,9 @@ fn wanted(topic: &Topic<'_>) -> (Option<f64>, Option<f64>) {
     )
 }
 
-fn standing(topic: &Topic<'_>, is_measured: bool) -> Standing {
+fn row_state(topic: &Topic<'_>, is_measured: bool) -> RowState {
     if topic.vanished {
-        return Standing::Gone;
+        return RowState::Gone;
     }
     let has = |state: &str| topic.watches.iter().any(|watch| watch.state == state);
     let is_blind = topic.reasons.iter().any(|reason| {
@@ -264,18 +271,18 @@ fn standing(topic: &Topic<'_>, is_measured: bool) -> Standing {
         .and_then(|it| it.rate_hertz)
         .is_some_and(|rate| rate > 0.0);
     match () {
-        () if has("violated") => Standing::Violated,
-        () if is_blind && !flows => Standing::Unseen,
-        () if !is_measured => Standing::Unwatched,
-        () if has("silent") => Standing::Silent,
-        () if has("not_published") || topic.publishers.is_empty() => Standing::NotPublished,
-        () if topic.subscriptions.is_empty() && !flows => Standing::NoSubscriber,
-        () if !flows => Standing::Quiet,
-        () => Standing::Ok,
+        () if has("violated") => RowState::Violated,
+        () if is_blind && !flows => RowState::Unseen,
+        () if !is_measured => RowState::Unwatched,
+        () if has("silent") => RowState::Silent,
+        () if has("not_published") || topic.publishers.is_empty() => RowState::NotPublished,
+        () if topic.subscriptions.is_empty() && !flows => RowState::NoSubscriber,
+        () if !flows => RowState::Quiet,
+        () => RowState::Ok,
     }
 }
 
-fn problems(topic: &Topic<'_>, standing: Standing, is_losing: bool) -> Vec<&'static str> {
+fn problems(topic: &Topic<'_>, standing: RowState, is_losing: bool) -> Vec<&'static str> {
     let mut problems = Vec::new();
     let mut say = |word| {
         if !problems.contains(&word) {
@@ -295,13 +302,13 @@ fn problems(topic: &Topic<'_>, standing: Standing, is_losing: bool) -> Vec<&'sta
         });
     }
     match standing {
-        Standing::Violated if topic.watches.iter().all(|it| it.violations.is_empty()) => {
+        RowState::Violated if topic.watches.iter().all(|it| it.violations.is_empty()) => {
             say("violated");
         }
-        Standing::Silent => say("silent"),
-        Standing::Unseen => say("unseen"),
+        RowState::Silent => say("silent"),
+        RowState::Unseen => say("unseen"),
         // Subscribers without a publisher are common, but a watch on the exact name expects one.
-        Standing::NotPublished if topic.watches.iter().any(|it| !it.watch.contains('*')) => {
+        RowState::NotPublished if topic.watches.iter().any(|it| !it.watch.contains('*')) => {
             say("no pub");
         }
         _ => {}
@@ -396,8 +403,7 @@ impl Column {
             Self::Publishers => turn(other.publishers.cmp(&one.publishers)),
             Self::Subscribers => turn(other.subscriptions.cmp(&one.subscriptions)),
             Self::State => turn(
-                (one.problems.is_empty(), one.standing)
-                    .cmp(&(other.problems.is_empty(), other.standing)),
+                (one.problems.is_empty(), one.state).cmp(&(other.problems.is_empty(), other.state)),
             ),
         };
         order.then_with(names)

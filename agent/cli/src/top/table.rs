@@ -6,7 +6,7 @@ use super::row::{Column, Row};
 use super::text;
 
 /// Minimum width of the name column.
-const NAME: usize = 20;
+const MIN_NAME_WIDTH: usize = 20;
 /// Maximum width of the state column.
 const MAX_STATE: usize = 28;
 
@@ -70,7 +70,7 @@ impl Field {
     /// Returns the minimum width of the column.
     const fn width(self) -> usize {
         match self {
-            Self::Name => NAME,
+            Self::Name => MIN_NAME_WIDTH,
             Self::Type => 12,
             Self::Wanted => 7,
             Self::Rate | Self::Bandwidth => 6,
@@ -104,7 +104,7 @@ impl Field {
             Self::Domain => row.key.domain_id.to_string(),
             Self::Type => row.message_type.clone(),
             Self::Rate => known(row.rate, text::rate),
-            Self::Wanted => match row.wanted {
+            Self::Wanted => match row.expected_rate {
                 (None, None) => String::new(),
                 (Some(least), None) => format!(">={}", text::bound(least)),
                 (None, Some(most)) => format!("<={}", text::bound(most)),
@@ -130,14 +130,14 @@ impl Table {
     #[must_use]
     pub fn plan(width: usize, rows: &[&Row], cut: char) -> Self {
         let domains: BTreeSet<_> = rows.iter().map(|row| row.key.domain_id).collect();
-        let is_expected = rows.iter().any(|row| row.wanted != (None, None));
+        let is_expected = rows.iter().any(|row| row.expected_rate != (None, None));
         let is_late = rows.iter().any(|row| row.late.is_some());
         let longest = |field: Field| {
             let lengths = rows.iter().map(|row| field.value(row).chars().count());
             lengths.max().unwrap_or(0)
         };
         let mut columns = vec![Field::Name, Field::Rate, Field::State];
-        let mut left = width.saturating_sub(NAME + 6 + 9 + 2);
+        let mut left = width.saturating_sub(MIN_NAME_WIDTH + 6 + 9 + 2);
         let commands = [
             (Field::Domain, domains.len() > 1),
             (Field::Bandwidth, true),
@@ -172,9 +172,9 @@ impl Table {
             columns.push(Field::Type);
         }
         // On a narrow screen, the name takes the remaining width.
-        let least = NAME + 6 + 9 + 2;
+        let least = MIN_NAME_WIDTH + 6 + 9 + 2;
         let name = if width < least {
-            NAME.saturating_sub(least - width)
+            MIN_NAME_WIDTH.saturating_sub(least - width)
         } else {
             name
         };
@@ -194,7 +194,7 @@ impl Table {
     /// Returns all columns, each as wide as its widest cell.
     #[must_use]
     pub fn whole(rows: &[&Row], cut: char) -> Self {
-        let is_expected = rows.iter().any(|row| row.wanted != (None, None));
+        let is_expected = rows.iter().any(|row| row.expected_rate != (None, None));
         let fields = Field::ORDER.into_iter();
         let is_late = rows.iter().any(|row| row.late.is_some());
         let fields = fields.filter(|field| match field {

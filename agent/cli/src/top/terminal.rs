@@ -20,15 +20,15 @@ use tokio::signal::unix::{SignalKind, signal};
 use super::poller::Input;
 
 /// Exit code of a panic.
-const PANICKED: i32 = 101;
+const EXIT_PANIC: i32 = 101;
 /// Offset that a shell adds to the number of a signal.
-const SIGNALLED: u8 = 128;
+const SIGNAL_EXIT_OFFSET: u8 = 128;
 
 /// Maximum duration of a drawing. A signal then ends the program without waiting for the drawing.
-const TIMEOUT: Duration = Duration::from_secs(2);
+const DRAWING_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Whether the terminal is in raw mode.
-static TAKEN: AtomicBool = AtomicBool::new(false);
+static IN_RAW_MODE: AtomicBool = AtomicBool::new(false);
 
 /// The terminal in raw mode, until this value is dropped.
 #[derive(Debug)]
@@ -52,9 +52,9 @@ impl Screen {
             give_back();
             before(panic);
             // After a panic of a reading thread, the screen would never update again.
-            std::process::exit(PANICKED);
+            std::process::exit(EXIT_PANIC);
         }));
-        TAKEN.store(true, Ordering::Relaxed);
+        IN_RAW_MODE.store(true, Ordering::Relaxed);
         let taken = enable_raw_mode()
             .and_then(|()| execute!(io::stdout(), EnterAlternateScreen, cursor::Hide))
             .and_then(|()| Terminal::new(CrosstermBackend::new(BufWriter::new(io::stdout()))));
@@ -81,7 +81,7 @@ impl Drop for Screen {
 
 /// Restores the terminal. Failures, for example after a hangup, are ignored.
 fn give_back() {
-    if TAKEN.swap(false, Ordering::Relaxed) {
+    if IN_RAW_MODE.swap(false, Ordering::Relaxed) {
         let _ = disable_raw_mode();
         let _ = execute!(io::stdout(), LeaveAlternateScreen, cursor::Show);
         let _ = io::stdout().flush();
@@ -141,9 +141,9 @@ pub fn listen_to_signals(inputs: SyncSender<Input>) -> io::Result<()> {
             }
         });
         let number = u8::try_from(kind.as_raw_value()).unwrap_or_default();
-        let code = SIGNALLED.saturating_add(number);
+        let code = SIGNAL_EXIT_OFFSET.saturating_add(number);
         let _ = inputs.try_send(Input::End(code));
-        thread::sleep(TIMEOUT);
+        thread::sleep(DRAWING_TIMEOUT);
         // The terminal is blocked and drawing waits for it, so only its settings can be restored.
         let _ = disable_raw_mode();
         std::process::exit(code.into());
@@ -171,7 +171,7 @@ mod tests {
             let _screen = Screen::open().unwrap();
             let reader = thread::spawn(|| panic!("the reason"));
             let _ = reader.join();
-            thread::sleep(TIMEOUT);
+            thread::sleep(DRAWING_TIMEOUT);
         }
     }
 
@@ -183,7 +183,7 @@ mod tests {
             .env("PANICS_ON_A_SCREEN", "1")
             .env("TERM", "xterm");
         let mut terminal = pseudo_terminal::Terminal::start(&mut command);
-        assert_eq!(terminal.ends(), Some(PANICKED));
+        assert_eq!(terminal.ends(), Some(EXIT_PANIC));
         terminal.assert_settings_given_back();
         let written = terminal.written();
         let (_, after) = written.rsplit_once("\x1b[?1049l").unwrap();

@@ -8,7 +8,7 @@ const MAX_CHARACTERS: usize = 256;
 
 /// Escapes all characters of `text` other than printable ASCII.
 #[must_use]
-pub fn safe(text: &str) -> String {
+pub fn escaped(text: &str) -> String {
     let mut shown = String::with_capacity(text.len().min(MAX_CHARACTERS));
     for (at, character) in text.chars().enumerate() {
         if at == MAX_CHARACTERS {
@@ -130,14 +130,14 @@ mod tests {
     #[test]
     fn a_hostile_name_cannot_control_the_terminal() {
         let hostile = "/a\x1b[2J\x1b]0;title\x07\r\n\t\u{9b}31m\u{202e}gpj\u{200b}\u{7f}\u{fffd}";
-        let shown = safe(hostile);
+        let shown = escaped(hostile);
         assert!(shown.chars().all(|each| (' '..='~').contains(&each)));
         assert!(
             shown.starts_with(r"/a\u{1b}[2J\u{1b}]0;title\u{7}\r\n\t\u{9b}31m"),
             "{shown}"
         );
-        assert_eq!(safe("/camera/front"), "/camera/front");
-        assert_eq!(safe(&"x".repeat(10_000)).len(), MAX_CHARACTERS + 3);
+        assert_eq!(escaped("/camera/front"), "/camera/front");
+        assert_eq!(escaped(&"x".repeat(10_000)).len(), MAX_CHARACTERS + 3);
     }
 
     #[test]
@@ -171,7 +171,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn numbers_fit_their_columns(value in 0.0_f64..1e12) {
+        fn numbers_are_no_wider_than_their_columns(value in 0.0_f64..1e12) {
             prop_assert!(rate(value.min(1e8)).len() <= 7, "{}", rate(value));
             prop_assert!(bytes(value).len() <= 6, "{}", bytes(value));
             prop_assert!(seconds(value).len() <= 5, "{}", seconds(value));

@@ -12,19 +12,19 @@ use super::details::{self, Styled};
 use super::header;
 use super::help;
 use super::table::Table;
-use super::text::{beginning, safe};
+use super::text::{beginning, escaped};
 use super::theme::{Kind, Theme};
 
 /// Minimum usable size: columns and lines.
-pub const LEAST: (u16, u16) = (40, 8);
+pub const MIN_SIZE: (u16, u16) = (40, 8);
 /// Columns before each topic for two marks: selected, and measured on behalf of this program.
-const MARKS: usize = 2;
+const MARK_COLUMNS: usize = 2;
 
 /// Draws the screen, and stores the heights of the panes in the state.
 pub fn draw(app: &mut App, frame: &mut Frame<'_>, theme: Theme, now: Instant) {
     let area = frame.area();
-    if area.width < LEAST.0 || area.height < LEAST.1 {
-        let (width, height) = LEAST;
+    if area.width < MIN_SIZE.0 || area.height < MIN_SIZE.1 {
+        let (width, height) = MIN_SIZE;
         let text = format!("rp top needs {width}x{height}");
         put(frame, area, 0, &text, theme, Kind::Plain);
         return;
@@ -122,16 +122,16 @@ impl Panes {
 }
 
 fn topics(app: &App, frame: &mut Frame<'_>, area: Rect, theme: Theme) {
-    let width = usize::from(area.width) - MARKS;
+    let width = usize::from(area.width) - MARK_COLUMNS;
     let rows: Vec<_> = app.shown().collect();
     let table = Table::plan(width, &rows, theme.cut());
     let (heading, sorted) = table.heading(app.sort);
-    let heading = format!("{:MARKS$}{heading}", "");
+    let heading = format!("{:MARK_COLUMNS$}{heading}", "");
     put(frame, area, 0, &heading, theme, Kind::Heading);
     if let Some((at, width)) = sorted {
         let column = |at: usize| u16::try_from(at).unwrap_or(u16::MAX);
         let area = Rect {
-            x: area.x + column(MARKS + at),
+            x: area.x + column(MARK_COLUMNS + at),
             width: column(width),
             height: 1,
             ..area
@@ -141,12 +141,12 @@ fn topics(app: &App, frame: &mut Frame<'_>, area: Rect, theme: Theme) {
     }
     let body = below(area);
     if rows.is_empty() {
-        put(frame, body, 0, nothing(app), theme, Kind::Plain);
+        put(frame, body, 0, empty_text(app), theme, Kind::Plain);
     }
     let visible = rows.iter().skip(app.offset).zip(0..body.height);
     for (row, at) in visible {
         let is_selected = app.selected.as_ref() == Some(&row.key);
-        let hold = match app.holds.get(&row.key) {
+        let hold = match app.measured_topics.get(&row.key) {
             None => ' ',
             Some(MeasuredBy::Session) => '+',
             Some(MeasuredBy::Watch) => '=',
@@ -164,7 +164,7 @@ fn topics(app: &App, frame: &mut Frame<'_>, area: Rect, theme: Theme) {
 }
 
 /// Returns the reason for an empty table.
-fn nothing(app: &App) -> &'static str {
+fn empty_text(app: &App) -> &'static str {
     match (app.updated, app.rows().is_empty()) {
         (None, _) => "  waiting for the agent",
         (Some(_), true) => "  no topics yet",
@@ -202,7 +202,7 @@ fn events(app: &App, frame: &mut Frame<'_>, area: Rect, theme: Theme) {
 fn footer(app: &App, frame: &mut Frame<'_>, area: Rect, theme: Theme, now: Instant) {
     let last = area.height.saturating_sub(1);
     if app.editing.is_some() {
-        let text = format!("/{}", safe(&app.filter.text));
+        let text = format!("/{}", escaped(&app.filter.text));
         put(frame, area, last, &text, theme, Kind::Plain);
         let column = u16::try_from(text.len()).unwrap_or(u16::MAX);
         let x = area.x + column.min(area.width.saturating_sub(1));

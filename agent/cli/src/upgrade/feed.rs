@@ -201,7 +201,7 @@ impl fmt::Display for Version {
 impl Location {
     /// Returns the location of a file in the same directory.
     #[must_use]
-    pub(super) fn beside(&self, name: &str) -> Self {
+    pub(super) fn sibling(&self, name: &str) -> Self {
         match self {
             Self::Path(path) => Self::Path(path.with_file_name(name)),
             Self::Address(address) => {
@@ -264,7 +264,7 @@ mod tests {
             ("http://[::1]:80", "http://[::1]:80/rp"),
         ] {
             let location: Location = feed.parse().unwrap();
-            assert_eq!(location.beside("rp").to_string(), file);
+            assert_eq!(location.sibling("rp").to_string(), file);
         }
         for wrong in ["ftp://a.org/x", "file:///x", "https://", "https:// a"] {
             assert!(wrong.parse::<Location>().is_err(), "{wrong}");

@@ -40,7 +40,7 @@ impl Comparison {
         let newest = feed.version;
         let is_newer = newest > installed;
         let found = installation.file(feed).filter(|_| is_newer);
-        let file = found.map(|(name, _)| at.beside(name));
+        let file = found.map(|(name, _)| at.sibling(name));
         Self {
             installed,
             newest,

@@ -317,15 +317,15 @@ fn messages(bag: &str) -> Vec<(String, u64, u64, Vec<u8>)> {
 #[test]
 fn live_capture_without_bpf_is_refused_with_one_line() {
     let refused = Program::arm().run(&["run", "--metrics", "off", "--api", "off"]);
-    let said = text(&refused.stderr);
-    assert_eq!(refused.status.code(), Some(1), "{said}");
+    let printed = text(&refused.stderr);
+    assert_eq!(refused.status.code(), Some(1), "{printed}");
     assert_eq!(
-        said.lines().last(),
+        printed.lines().last(),
         Some(
             "rp: BPF is not available: not supported by this kernel or emulator: Function not \
              implemented (os error 38)"
         ),
-        "{said}"
+        "{printed}"
     );
 }
 

@@ -176,14 +176,14 @@ fn prometheus_accepts_its_configurations() -> Result<()> {
         deploy().join("prometheus/robots.yaml"),
         directory.path().join("robots.yaml"),
     )?;
-    let said = promtool(&["check", "config"], &copy)?;
-    ensure!(said.matches("rules found").count() == 2, "{said}");
+    let printed = promtool(&["check", "config"], &copy)?;
+    ensure!(printed.matches("rules found").count() == 2, "{printed}");
 
-    let said = promtool(
+    let printed = promtool(
         &["check", "config"],
         &deploy().join("fleet/prometheus-scrape.yaml"),
     )?;
-    ensure!(said.matches("rules found").count() == 2, "{said}");
+    ensure!(printed.matches("rules found").count() == 2, "{printed}");
     promtool(
         &["check", "config", "--agent"],
         &deploy().join("fleet/prometheus-agent.yaml"),
@@ -589,8 +589,8 @@ fn json_files(directory: &Path) -> Result<Vec<PathBuf>> {
 fn promtool(arguments: &[&str], file: &Path) -> Result<String> {
     let output = Command::new("promtool").args(arguments).arg(file).output();
     let output = output.context("run `make prerequisites` or `apt-get install prometheus`")?;
-    let said = [output.stdout, output.stderr].concat();
-    let said = String::from_utf8_lossy(&said).into_owned();
-    ensure!(output.status.success(), "{}: {said}", file.display());
-    Ok(said)
+    let printed = [output.stdout, output.stderr].concat();
+    let printed = String::from_utf8_lossy(&printed).into_owned();
+    ensure!(output.status.success(), "{}: {printed}", file.display());
+    Ok(printed)
 }

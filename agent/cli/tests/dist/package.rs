@@ -36,7 +36,7 @@ fn the_package_contains_what_an_operator_expects() -> Result<()> {
 }
 
 #[test]
-fn the_same_binary_makes_the_same_package() -> Result<()> {
+fn the_same_binary_yields_the_same_package() -> Result<()> {
     let directory = tempfile::tempdir()?;
     let mut made = Vec::new();
     for place in ["once", "again/elsewhere"] {
@@ -63,7 +63,7 @@ fn a_host_with_systemd_runs_the_agent_until_the_package_is_purged() -> Result<()
     a_service_without_any_source_ends_with_the_missing_lines(&host)?;
     the_socket_admits_the_group_only(&host)?;
     an_upgrade_keeps_the_operators_configuration(&host, &upgrade)?;
-    a_stopped_or_disabled_service_stays_so(&host, &old, &upgrade)?;
+    check_disabled_service(&host, &old, &upgrade)?;
     a_wrong_configuration_fails_the_service_only(&host, &upgrade)?;
 
     host.run("dpkg --remove ros2probe")?;
@@ -75,7 +75,7 @@ fn a_host_with_systemd_runs_the_agent_until_the_package_is_purged() -> Result<()
     prints(&host, RUNS, "active")?;
     prints(&host, STARTS_AT_BOOT, "enabled")?;
     host.run("dpkg --purge ros2probe")?;
-    nothing_left(&host)
+    check_no_files(&host)
 }
 
 /// Fails unless the command prints this, whatever its exit code.
@@ -182,7 +182,7 @@ fn the_socket_admits_the_group_only(host: &Debian) -> Result<()> {
     host.run("useradd --groups ros2probe member; useradd stranger")?;
     let list = |user: &str| {
         let ids = format!("--reuid {user} --regid {user} --init-groups");
-        host.attempt(&format!("setpriv {ids} rp topic list"))
+        host.run_script(&format!("setpriv {ids} rp topic list"))
     };
     ensure!(
         list("member")?.status.success(),
@@ -211,7 +211,7 @@ fn an_upgrade_keeps_the_operators_configuration(host: &Debian, upgrade: &str) ->
 }
 
 /// Checks that a downgrade and an upgrade keep the operator's choice.
-fn a_stopped_or_disabled_service_stays_so(host: &Debian, old: &str, upgrade: &str) -> Result<()> {
+fn check_disabled_service(host: &Debian, old: &str, upgrade: &str) -> Result<()> {
     host.run("systemctl stop ros2probe")?;
     host.run(&format!("dpkg --force-confold --install {old}"))?;
     prints(host, RUNS, "inactive")?;
@@ -227,7 +227,7 @@ fn a_wrong_configuration_fails_the_service_only(host: &Debian, upgrade: &str) ->
     host.run(&format!(
         "systemctl enable --now ros2probe; cp {CONFIG} /srv/; echo wach: [] >>{CONFIG}"
     ))?;
-    let output = host.attempt(upgrade)?;
+    let output = host.run_script(upgrade)?;
     ensure!(
         output.status.success() && all(&output).contains("wach: unknown key"),
         "{}",
@@ -275,11 +275,11 @@ fn a_host_without_systemd_accepts_the_package() -> Result<()> {
     host.run("dpkg --remove ros2probe")?;
     host.run(&format!("test -e {CONFIG} && test -d /var/lib/ros2probe"))?;
     host.run("dpkg --purge ros2probe")?;
-    nothing_left(&host)
+    check_no_files(&host)
 }
 
 /// Checks that a purge leaves only the user and dpkg's own records.
-fn nothing_left(host: &Debian) -> Result<()> {
+fn check_no_files(host: &Debian) -> Result<()> {
     let left = host.run(
         "find / -xdev \\( -path /proc -o -path /sys -o -path /packages -o -path /var/log \\) -prune \
          -o \\( -name '*ros2probe*' -o -path '/usr/share/man/*/rp*' \\) -print",
@@ -313,7 +313,7 @@ fn serves_with_the_rights_of_the_unit(host: &Debian) -> Result<()> {
     wait_until("ready", || {
         Ok(host
             .get(17400, "/readyz")
-            .is_ok_and(|said| said.contains("200 OK")))
+            .is_ok_and(|output_text| output_text.contains("200 OK")))
     })
     .with_context(|| host.text("cat /tmp/log").unwrap_or_default())?;
     host.run("kill $(cat /tmp/pid)")?;
@@ -336,7 +336,7 @@ fn inside(package: &Path) -> Result<String> {
 
 fn complete(archive: &Archive) -> Result<()> {
     fields_and_scripts_are_complete(archive)?;
-    files_are_the_expected_ones(archive)?;
+    check_files(archive)?;
     let manual = "usr/share/man/man1/rp-topic-hz.1.gz";
     archive.manual_is_readable(manual)?;
     archive.compressed_without_dates()
@@ -384,7 +384,7 @@ fn fields_and_scripts_are_complete(archive: &Archive) -> Result<()> {
 }
 
 /// Checks that each file has its mode and that root owns all of them.
-fn files_are_the_expected_ones(archive: &Archive) -> Result<()> {
+fn check_files(archive: &Archive) -> Result<()> {
     let manual = "usr/share/man/man1/";
     let (pages, others): (BTreeMap<_, _>, BTreeMap<_, _>) = archive
         .files

@@ -233,7 +233,7 @@ fn rp_gets_exactly_the_arguments_and_its_exit_code_is_kept() -> Result<()> {
 }
 
 #[test]
-fn signals_reach_rp_because_it_replaces_python() -> Result<()> {
+fn rp_replaces_python_and_receives_signals() -> Result<()> {
     let prefix = prefix()?;
     let run = [
         "run",
@@ -271,7 +271,7 @@ fn signals_reach_rp_because_it_replaces_python() -> Result<()> {
 }
 
 #[test]
-fn rp_in_path_precedes_the_package_and_none_is_one_clear_line() -> Result<()> {
+fn rp_in_path_precedes_the_package_and_its_absence_is_one_line() -> Result<()> {
     const FIND: &str = "from ros2probe_cli.program import find; print(find())";
     let prefix = prefix()?;
     let found = succeed(&mut python(prefix.path(), FIND, &[]))?;
@@ -311,7 +311,7 @@ fn commands_options_and_names_complete() -> Result<()> {
     ensure!(candidates(&["topic", "hz", "/nothing/of/it"])?.is_empty());
 
     // Names of topics come from the agent of this host.
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let _agent = Process::start_with(
         &network.inside(),
         RP,

@@ -49,12 +49,12 @@ fn exposure(unit: &Path) -> f64 {
         !refused.contains("unrecognized option"),
         "scoring a unit that is not installed needs systemd 250: {refused}"
     );
-    let said = String::from_utf8_lossy(&output.stdout).into_owned();
-    let level = said.lines().find_map(|line| {
+    let printed = String::from_utf8_lossy(&output.stdout).into_owned();
+    let level = printed.lines().find_map(|line| {
         let (_, level) = line.split_once("Overall exposure level for ")?;
         level.split_whitespace().nth(1)?.parse::<f64>().ok()
     });
-    level.unwrap_or_else(|| panic!("no level in\n{said}"))
+    level.unwrap_or_else(|| panic!("no level in\n{printed}"))
 }
 
 #[test]
@@ -90,13 +90,13 @@ fn systemd_accepts_the_lines_that_the_unit_and_the_package_offer() {
 
 fn accepts(unit: &Path) {
     let output = systemd_analyze(&["verify", "--man=no"], unit);
-    let said = String::from_utf8_lossy(&output.stderr);
+    let printed = String::from_utf8_lossy(&output.stderr);
     // Messages about other units on the machine are ignored.
-    let ours: Vec<&str> = said
+    let ours: Vec<&str> = printed
         .lines()
         .filter(|line| line.contains("ros2probe"))
         .collect();
-    assert!(ours.is_empty(), "{said}");
+    assert!(ours.is_empty(), "{printed}");
 }
 
 #[test]

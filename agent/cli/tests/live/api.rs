@@ -20,7 +20,7 @@ const MANY: usize = 1000;
 
 #[test]
 fn watches_are_added_and_removed_while_a_robot_runs() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let configuration = directory.path().join("ros2probe.yaml");
     let (state, socket) = (
@@ -46,10 +46,10 @@ fn watches_are_added_and_removed_while_a_robot_runs() -> Result<()> {
         |scrape: &Scrape| scrape.sum("ros2_topic_publishers", &[("topic", "/imu")]) > 0.0;
     wait_for(&agent, published).context("the publisher is not seen")?;
 
-    nothing_stays(&agent, &api)?;
+    check_watches_removed(&agent, &api)?;
 
-    publisher.go()?;
-    soon(&agent, &api, &publisher)?;
+    publisher.start_sending()?;
+    wait_soon(&agent, &api, &publisher)?;
 
     watches_survive_a_kill(agent, &start, &api, &state)?;
     a_corrupt_file_is_set_aside(&start, &api, &state)?;
@@ -129,7 +129,7 @@ fn state_of_a_newer_rp_stays(start: Start<'_>, api: &Api<'_>, state: &Path) -> R
 
 /// Checks that a thousand watches, and one that the kernel needs, leave nothing in the kernel's
 /// map, in the agent's tables or on the page.
-fn nothing_stays(agent: &Agent<'_>, api: &Api<'_>) -> Result<()> {
+fn check_watches_removed(agent: &Agent<'_>, api: &Api<'_>) -> Result<()> {
     // A topic that was watched before keeps its counts.
     for method in ["POST", "DELETE"] {
         api.ask(method, "imu")?;
@@ -191,7 +191,7 @@ fn nothing_stays(agent: &Agent<'_>, api: &Api<'_>) -> Result<()> {
 }
 
 /// Checks that a sample counts less than 100 ms after the request for a watch.
-fn soon(agent: &Agent<'_>, api: &Api<'_>, publisher: &Peer) -> Result<()> {
+fn wait_soon(agent: &Agent<'_>, api: &Api<'_>, publisher: &Peer) -> Result<()> {
     let labels = [("domain_id", "0"), ("topic", "/imu")];
     let of = |scrape: &Scrape, name| scrape.value(name, &labels).unwrap_or_default();
     let messages = |scrape: &Scrape| of(scrape, "ros2_topic_messages_total");

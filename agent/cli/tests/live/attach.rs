@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context as _, Result, ensure};
 use ros2probe_testing::harness::PREFIX;
 use ros2probe_testing::harness::agent::{Agent, get};
-use ros2probe_testing::harness::bpf::{self, Direction, Manners};
+use ros2probe_testing::harness::bpf::{self, AttachMode, Direction};
 use ros2probe_testing::harness::cgroup::Cgroup;
 use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
@@ -40,11 +40,11 @@ fn nodes_lose_no_sample_while_agents_start_and_stop() -> Result<()> {
     let link = Link::below(&above)?;
     let configuration = Configuration::at(above.path())?;
     // The same streams without an agent are the baseline of the machine.
-    let mut alone = Talks::start(&link)?;
+    let mut alone = Streams::start(&link)?;
     std::thread::sleep(Duration::from_secs(3));
     alone.ensure_lossless().context("without any agent")?;
 
-    let mut talks = Talks::start(&link)?;
+    let mut talks = Streams::start(&link)?;
     // After the first start, the library has opened everything that it keeps open.
     Witness::start(&configuration.text)?.finish()?;
     let descriptors = open_descriptors()?;
@@ -70,7 +70,7 @@ fn nodes_lose_no_sample_while_agents_start_and_stop() -> Result<()> {
     ensure_nothing_attached(above.path(), 0)?;
 
     for direction in DIRECTIONS {
-        bpf::attach_stranger(above.path(), direction, Manners::BesideOthers)?;
+        bpf::attach_foreign_program(above.path(), direction, AttachMode::Shared)?;
     }
     let one = configuration.start(&link.robot)?;
     let other = configuration.start(&link.monitor)?;
@@ -86,7 +86,7 @@ fn nodes_lose_no_sample_while_agents_start_and_stop() -> Result<()> {
         topic: "/later".to_owned(),
         ..Stream::small(200)
     };
-    talk(&later, &stream)?;
+    run_stream(&later, &stream)?;
     for agent in [&one, &other] {
         let scrape = agent.settled_scrape("/later", 200)?;
         let counted = scrape.sum("ros2_topic_messages_total", &[("topic", "/later")]);
@@ -110,7 +110,7 @@ fn an_exclusive_program_makes_the_agent_read_the_wire_and_report_why() -> Result
     let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
     let above = Cgroup::create(&format!("{PREFIX}-{}-alone", std::process::id()))?;
     let link = Link::below(&above)?;
-    bpf::attach_stranger(above.path(), Direction::Egress, Manners::Alone)?;
+    bpf::attach_foreign_program(above.path(), Direction::Egress, AttachMode::Exclusive)?;
     let configuration = Configuration::at(above.path())?;
     let mut refused = configuration.launch(&link.robot)?;
     ensure!(!refused.wait(PATIENCE)?.success(), "`source: host` came up");
@@ -119,7 +119,7 @@ fn an_exclusive_program_makes_the_agent_read_the_wire_and_report_why() -> Result
         above.path().display()
     ))?;
     let agent = configuration.start(&link.robot)?;
-    talk(&link, &Stream::small(200))?;
+    run_stream(&link, &Stream::small(200))?;
     let scrape = agent.settled_scrape("/imu", 200)?;
     let wire = [("source", "wire")];
     ensure!(
@@ -139,11 +139,11 @@ fn a_recreated_cgroup_is_observed_again_and_reported_while_it_is_missing() -> Re
     let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
     let name = format!("{PREFIX}-{}-anew", std::process::id());
     // The agent is in none of the removed groups.
-    let elsewhere = Namespace::alone()?;
+    let elsewhere = Namespace::isolated()?;
     let above = Cgroup::create(&name)?;
     let configuration = Configuration::at(above.path())?;
     let mut agent = configuration.start(&elsewhere)?;
-    let tells = |what: &str, round: usize| {
+    let wait_for_event = |what: &str, round: usize| {
         eventually(|| {
             let events = get(
                 &elsewhere,
@@ -164,7 +164,7 @@ fn a_recreated_cgroup_is_observed_again_and_reported_while_it_is_missing() -> Re
             topic: topic.clone(),
             ..Stream::small(200)
         };
-        talk(&link, &stream)?;
+        run_stream(&link, &stream)?;
         let scrape = agent.settled_scrape(&topic, 200)?;
         let counted = scrape.sum("ros2_topic_messages_total", &[("topic", &topic)]);
         ensure!(counted == 200.0, "counted {counted} in round {round}");
@@ -176,11 +176,11 @@ fn a_recreated_cgroup_is_observed_again_and_reported_while_it_is_missing() -> Re
         ensure!(able == 0.0, "{able} abilities without a cgroup");
         let health = agent.request("/healthz");
         ensure!(health.is_ok(), "the agent is gone: {health:?}");
-        tells("\"ros2probe.capture.blind\"", round)?;
-        tells("was removed", round)?;
+        wait_for_event("\"ros2probe.capture.blind\"", round)?;
+        wait_for_event("was removed", round)?;
         std::fs::create_dir(above.path())?;
         agent.wait_ready(PATIENCE)?;
-        tells("\"ros2probe.capture.seeing\"", round)?;
+        wait_for_event("\"ros2probe.capture.seeing\"", round)?;
         for direction in DIRECTIONS {
             let attached = bpf::attached(above.path(), direction)?;
             ensure!(attached == PROGRAMS, "{attached} programs are attached");
@@ -193,7 +193,7 @@ fn a_recreated_cgroup_is_observed_again_and_reported_while_it_is_missing() -> Re
 #[test]
 fn a_briefly_missing_cgroup_is_reported_and_observed_again() -> Result<()> {
     let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
-    let elsewhere = Namespace::alone()?;
+    let elsewhere = Namespace::isolated()?;
     let above = Cgroup::create(&format!("{PREFIX}-{}-moment", std::process::id()))?;
     let configuration = Configuration::at(above.path())?;
     let mut agent = configuration.start(&elsewhere)?;
@@ -218,7 +218,7 @@ fn a_briefly_missing_cgroup_is_reported_and_observed_again() -> Result<()> {
         ensure!(attached == PROGRAMS, "{attached} programs are attached");
     }
     let link = Link::below(&above)?;
-    talk(&link, &Stream::small(200))?;
+    run_stream(&link, &Stream::small(200))?;
     let scrape = agent.settled_scrape("/imu", 200)?;
     let counted = scrape.sum("ros2_topic_messages_total", &[("topic", "/imu")]);
     ensure!(counted == 200.0, "counted {counted}");
@@ -273,14 +273,14 @@ impl Configuration {
 }
 
 /// A stream of small samples and one of point clouds.
-struct Talks {
+struct Streams {
     publishers: Vec<Peer>,
     subscribers: Vec<Peer>,
 }
 
-impl Talks {
-    fn start(link: &Link) -> Result<Talks> {
-        let mut talks = Talks {
+impl Streams {
+    fn start(link: &Link) -> Result<Streams> {
+        let mut talks = Streams {
             publishers: Vec::new(),
             subscribers: Vec::new(),
         };
@@ -323,7 +323,10 @@ impl Talks {
         }
         // Fast DDS notifies its subscriber before the publisher.
         std::thread::sleep(Duration::from_millis(300));
-        talks.publishers.iter_mut().try_for_each(Peer::go)?;
+        talks
+            .publishers
+            .iter_mut()
+            .try_for_each(Peer::start_sending)?;
         Ok(talks)
     }
 
@@ -366,7 +369,7 @@ impl Talks {
 }
 
 /// Runs a stream from beginning to end, and checks that all of it is received.
-fn talk(link: &Link, stream: &Stream) -> Result<()> {
+fn run_stream(link: &Link, stream: &Stream) -> Result<()> {
     let host = &link.monitor;
     let mut subscriber = Peer::start(
         host,
@@ -379,7 +382,7 @@ fn talk(link: &Link, stream: &Stream) -> Result<()> {
     let mut publisher = Peer::start(host, Stack::Cyclone, Role::Publisher, stream, &["/talker"])?;
     publisher.wait_matched()?;
     subscriber.wait_matched()?;
-    publisher.go()?;
+    publisher.start_sending()?;
     publisher.wait_sent(PATIENCE)?;
     std::thread::sleep(Duration::from_millis(300));
     let received = subscriber.log()?.writer_numbers("sub")?.len() as u64;

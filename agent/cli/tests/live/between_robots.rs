@@ -18,11 +18,11 @@ use ros2probe_testing::harness::switch::Switched;
 
 /// Samples of six seconds.
 const SAMPLES: u64 = 1_200;
-const STRETCH: u64 = 40;
+const SAMPLES_PER_STRETCH: u64 = 40;
 /// Maximum time for repairs, scrapes and rules on a busy machine.
 const PATIENCE: Duration = Duration::from_secs(40);
 /// Gaps are settled after a second. Scrapes and rules take another second each.
-const STILL: Duration = Duration::from_millis(3500);
+const SETTLE_TIME: Duration = Duration::from_millis(3500);
 const PER_MILLE: u16 = 200;
 /// Ratio of dropped frames, of which a point cloud takes some 450.
 const FRAMES_PER_MILLE: u16 = 1;
@@ -35,7 +35,7 @@ enum Source {
 
 /// Counts of one writer's samples from one robot to the other.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Journey {
+struct TransferCounts {
     published: u64,
     received: u64,
     dropped: u64,
@@ -97,7 +97,7 @@ fn cyclone_dds_point_clouds_with_a_lost_frame_equal_the_difference_of_counts() -
 }
 
 fn best_effort(source: Source, stack: Stack) -> Result<()> {
-    let seen = Journey::of(source, stack, &stream())?;
+    let seen = TransferCounts::of(source, stack, &stream())?;
     let lost = seen.lost();
     ensure!(seen.published == SAMPLES, "{} published", seen.published);
     ensure!(
@@ -118,8 +118,8 @@ fn best_effort(source: Source, stack: Stack) -> Result<()> {
     );
     // Each rate starts with the first scrape, during the first stretch.
     let lost_of = |received: u64, published: u64| 1.0 - received as f64 / published as f64;
-    let least = lost_of(seen.received, seen.published - STRETCH);
-    let most = lost_of(seen.received - STRETCH, seen.published);
+    let least = lost_of(seen.received, seen.published - SAMPLES_PER_STRETCH);
+    let most = lost_of(seen.received - SAMPLES_PER_STRETCH, seen.published);
     let expected = least - 0.05..most + 0.05;
     ensure!(
         expected.contains(&seen.ratio),
@@ -134,7 +134,7 @@ fn reliable(source: Source, stack: Stack) -> Result<()> {
         reliable: true,
         ..stream()
     };
-    let seen = Journey::of(source, stack, &stream)?;
+    let seen = TransferCounts::of(source, stack, &stream)?;
     ensure!(seen.dropped > SAMPLES / 10, "{} dropped", seen.dropped);
     // Some samples are overwritten in the writer's history before they can be sent again.
     let lost = seen.lost();
@@ -157,7 +157,7 @@ fn point_clouds(stack: Stack) -> Result<()> {
         stretch: 10,
         ..Stream::point_cloud(644_000, 120)
     };
-    let seen = Journey::of(Source::Host, stack, &stream)?;
+    let seen = TransferCounts::of(Source::Host, stack, &stream)?;
     ensure!(seen.dropped > 10, "{} dropped", seen.dropped);
     ensure!(
         seen.is_explained() && seen.difference > 5.0,
@@ -173,13 +173,13 @@ fn point_clouds(stack: Stack) -> Result<()> {
 fn stream() -> Stream {
     Stream {
         linger: 60.0,
-        stretch: STRETCH,
+        stretch: SAMPLES_PER_STRETCH,
         ..Stream::small(SAMPLES)
     }
 }
 
-impl Journey {
-    fn of(source: Source, stack: Stack, stream: &Stream) -> Result<Journey> {
+impl TransferCounts {
+    fn of(source: Source, stack: Stack, stream: &Stream) -> Result<TransferCounts> {
         let Switched { link, switch } = Switched::new()?;
         let directory = tempfile::tempdir()?;
         let robot = start(&link.robot, source, stream, directory.path())?;
@@ -201,7 +201,7 @@ impl Journey {
         publisher.wait_matched()?;
         prometheus.wait_for("sum(up)", 2.0)?;
         // Rates begin with the second scrape of a series, so losses begin only after the first.
-        publisher.go()?;
+        publisher.start_sending()?;
         let topic = format!("topic=\"{}\"", stream.topic);
         let sent = format!("max(ros2_writer_sent_messages_total{{{topic}}})");
         prometheus.wait_for(&sent, stream.stretch as f64)?;
@@ -215,7 +215,7 @@ impl Journey {
         };
         while publisher.log()?.sequences("pub").len() as u64 + stream.stretch <= stream.count {
             let due = publisher.log()?.sequences("pub").len() as u64 + stream.stretch;
-            publisher.go()?;
+            publisher.start_sending()?;
             let deadline = Instant::now() + PATIENCE;
             while (publisher.log()?.sequences("pub").len() as u64) < due {
                 ensure!(Instant::now() < deadline, "{due} samples are not sent");
@@ -228,16 +228,16 @@ impl Journey {
         let deadline = Instant::now() + PATIENCE;
         let (mut before, mut since) = (None, Instant::now());
         let mut journey = loop {
-            let numbers = Journey::ask(&prometheus, &publisher, &subscriber, stream)?;
+            let numbers = TransferCounts::ask(&prometheus, &publisher, &subscriber, stream)?;
             // The ratio changes with time.
-            let counted = Journey {
+            let counted = TransferCounts {
                 ratio: 0.0,
                 ..numbers
             };
             if before.replace(counted) != Some(counted) {
                 since = Instant::now();
             }
-            let is_still = since.elapsed() >= STILL;
+            let is_still = since.elapsed() >= SETTLE_TIME;
             if is_still && numbers.is_explained() || Instant::now() > deadline {
                 break numbers;
             }
@@ -254,7 +254,7 @@ impl Journey {
         publisher: &Peer,
         subscriber: &Peer,
         stream: &Stream,
-    ) -> Result<Journey> {
+    ) -> Result<TransferCounts> {
         let labels = format!("topic=\"{}\"", stream.topic);
         let rule = |name: &str| {
             let series = format!("subscriber:ros2_between_hosts_lost_messages:{name}{{{labels}}}");
@@ -271,7 +271,7 @@ impl Journey {
         };
         let published: BTreeSet<u64> = publisher.log()?.sequences("pub").into_iter().collect();
         let received: BTreeSet<u64> = subscriber.log()?.sequences("sub").into_iter().collect();
-        Ok(Journey {
+        Ok(TransferCounts {
             published: published.len() as u64,
             received: received.len() as u64,
             dropped: 0,

@@ -149,7 +149,7 @@ fn images_maps_scans_and_poses_have_a_picture() -> Result<()> {
     }
     agent.scrape_until("all nodes", |page| page.sum("ros2_nodes", &[]) == 5.0)?;
     let mut passed = 0.0;
-    let said = || {
+    let output_text = || {
         passed += 0.5;
         let messages = [
             robot_pictures::image(20, 10, [200, 30, 10]),
@@ -164,7 +164,9 @@ fn images_maps_scans_and_poses_have_a_picture() -> Result<()> {
         }
         Ok(())
     };
-    while_repeating(said, || watch(&link.monitor.inside(), "previews", &[PAGE]))
+    while_repeating(output_text, || {
+        watch(&link.monitor.inside(), "previews", &[PAGE])
+    })
 }
 
 /// Repeats an action each second until another one has ended.
@@ -189,7 +191,7 @@ fn while_repeating(
 }
 
 #[test]
-fn what_the_robot_says_has_a_view_of_each_part() -> Result<()> {
+fn the_page_shows_logs_diagnostics_parameters_transforms_and_lifecycle() -> Result<()> {
     let link = Link::new()?;
     let config = tempfile::tempdir()?;
     let agent = robot_parts::agent(&link, &config, "")?;
@@ -275,7 +277,7 @@ fn unix_time() -> u64 {
 }
 
 #[test]
-fn tasks_beside_a_running_robot_take_few_clicks() -> Result<()> {
+fn tasks_on_a_running_robot_need_few_clicks() -> Result<()> {
     let place = Place::new()?;
     let state = place.directory.path().join("state");
     std::fs::create_dir(&state)?;
@@ -309,7 +311,7 @@ fn tasks_beside_a_running_robot_take_few_clicks() -> Result<()> {
 }
 
 #[test]
-fn tasks_on_captures_take_few_clicks() -> Result<()> {
+fn tasks_on_captures_need_few_clicks() -> Result<()> {
     let capture = data("cyclonedds/points-besteffort-lossy-2ns");
     let mut lossy = LocalAgent::replay(&mut rp(), &capture, &["--watch", "/**"]);
     lossy.wait_for_log("the capture has ended");
@@ -432,7 +434,7 @@ fn the_page_of_a_capture_shows_an_incident_of_the_past() -> Result<()> {
 }
 
 #[test]
-fn a_replay_is_paused_and_goes_to_the_next_event_in_the_page() -> Result<()> {
+fn the_page_pauses_a_replay_and_jumps_to_the_next_event() -> Result<()> {
     let capture = data("cyclonedds/points-besteffort-lossy-2ns");
     let agent = LocalAgent::replay(&mut rp(), &capture, &["--watch", "/**", "--speed", "0.1"]);
     watch(&[], "replay", &[&page(&agent)])
@@ -468,7 +470,7 @@ fn a_chain_is_shown_as_a_waterfall_and_as_a_path_in_the_graph() -> Result<()> {
             return Ok(json!({}));
         }
         let agent = agent.as_ref().context("no agent")?;
-        let (status, answer) = local_agent::ask(agent.api, "GET", question, "");
+        let (status, answer) = local_agent::call_api(agent.api, "GET", question, "");
         ensure!(status == 200, "{question}: {status}");
         Ok(answer)
     };
@@ -498,7 +500,7 @@ fn views_of_nodes_and_topics_show_figures_from_inside_processes() -> Result<()> 
     let mut answers = |question: &str| {
         match question {
             "create" => filter.create()?,
-            "work" => filter.work()?,
+            "work" => filter.publish_messages()?,
             "usual" => filter.usual()?,
             "late" => filter.late()?,
             _ => return place.ask(question),
@@ -548,7 +550,7 @@ fn a_token_grants_rights_that_loopback_does_not_have() -> Result<()> {
 /// Measures the first useful paint with 500 topics, the layout of large graphs, and a tab's memory.
 #[test]
 #[ignore = "measures for minutes: make page-bench"]
-fn measurements() -> Result<()> {
+fn paint_layout_and_memory_of_the_page_are_measured() -> Result<()> {
     let minutes = std::env::var("MEASURE_MINUTES").map_or(Ok(2), |text| text.parse::<u64>())?;
     let seconds = 60 + minutes * 60;
     let capture = large_robot(false, seconds)?;

@@ -51,7 +51,7 @@ fn topic(host: &Namespace) -> Result<Value> {
 
 /// Lets the publisher send a stretch, and waits until this subscriber has all of it.
 fn send(publisher: &mut Peer, subscriber: &Peer, all: usize) -> Result<()> {
-    publisher.go()?;
+    publisher.start_sending()?;
     received(subscriber, all)
 }
 
@@ -65,7 +65,7 @@ fn received(subscriber: &Peer, all: usize) -> Result<()> {
 // Coverage: buffer topics, cpu | Fast DDS 2.9 | as Lyrical | exact
 #[test]
 fn messages_of_a_cpu_topic_of_fast_dds_have_publisher_node_and_receiver() -> Result<()> {
-    let (host, directory) = (Namespace::alone()?, tempfile::tempdir()?);
+    let (host, directory) = (Namespace::isolated()?, tempfile::tempdir()?);
     let agent = start(&host, &directory)?;
     let stream = stream(Some("cpu"));
     let mut publisher = Peer::start(&host, Stack::Fast, Role::Publisher, &stream, &["/camera"])?;
@@ -100,8 +100,8 @@ fn camera(host: &Namespace) -> Result<Peer> {
 
 // Coverage: buffer topics, cpu | Zenoh 1.10 | as Lyrical | exact
 #[test]
-fn messages_of_zenoh_with_buffers_count_once_whatever_its_subscriptions_accept() -> Result<()> {
-    let (host, directory) = (Namespace::alone()?, tempfile::tempdir()?);
+fn zenoh_messages_with_buffers_count_once_for_all_subscriptions() -> Result<()> {
+    let (host, directory) = (Namespace::isolated()?, tempfile::tempdir()?);
     let agent = start(&host, &directory)?;
     let _router = peer::router(&host, &[])?;
     let mut publisher = camera(&host)?;
@@ -126,7 +126,7 @@ fn messages_of_zenoh_with_buffers_count_once_whatever_its_subscriptions_accept()
 // Coverage: buffer topics, references | Zenoh 1.10 | as Lyrical | counted
 #[test]
 fn references_alone_count_and_a_subscription_without_buffers_is_named() -> Result<()> {
-    let (host, directory) = (Namespace::alone()?, tempfile::tempdir()?);
+    let (host, directory) = (Namespace::isolated()?, tempfile::tempdir()?);
     let agent = start(&host, &directory)?;
     let _router = peer::router(&host, &[])?;
     let mut publisher = camera(&host)?;

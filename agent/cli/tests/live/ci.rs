@@ -81,19 +81,19 @@ impl Place {
 
     /// Starts `rp ci` on a host, with its report in the file `said`.
     fn start(&self, host: &Namespace, options: &[&str], script: &str) -> Result<Process> {
-        let said = File::create(self.path("said"))?;
+        let printed = File::create(self.path("said"))?;
         let arguments = self.arguments(options, script);
         let mut prefix = host.on_network();
         let temporary = format!("TMPDIR={}", self.path("temporary").display());
         prefix.extend(["env".to_owned(), temporary]);
-        Process::start_with(&prefix, RP, arguments, said.into())
+        Process::start_with(&prefix, RP, arguments, printed.into())
     }
 
     /// Waits for the end of `rp ci`, and checks its exit code.
     fn end(&self, process: &mut Process, code: i32) -> Result<Cases> {
         let status = process.wait(PATIENCE)?;
-        let said = fs::read_to_string(self.path("said"))?;
-        ensure!(status.code() == Some(code), "{status}: {said}");
+        let printed = fs::read_to_string(self.path("said"))?;
+        ensure!(status.code() == Some(code), "{status}: {printed}");
         self.is_clean()?;
         Cases::read(&self.path("out/junit.xml"))
     }
@@ -154,8 +154,9 @@ fn report(place: &Place) -> Result<String> {
     Ok(page)
 }
 
-/// Returns a script that runs a publisher and a subscriber of `/imu` for some seconds. RustDDS drops
-/// samples that its history overwrites before they are sent, so the history covers a busy machine.
+/// Returns a script that runs a publisher and a subscriber of `/imu` for some seconds. RustDDS
+/// drops samples that its history overwrites before they are sent, so the history covers a busy
+/// machine.
 fn healthy(seconds: u32) -> Result<String> {
     let robot = robot()?.display().to_string();
     let peer = |role: &str, node: &str| {
@@ -173,7 +174,7 @@ fn healthy(seconds: u32) -> Result<String> {
 
 #[test]
 fn a_healthy_robot_passes_and_leaves_complete_artefacts() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let place = Place::new(&format!(
         "{}watch:\n  - {{topic: /imu, min_rate_hz: 20, max_silence_s: 2, publishers: 1}}\n",
         at_the_sockets_of(&host)
@@ -239,7 +240,7 @@ fn lost_messages_and_a_low_rate_fail_by_the_name_of_the_topic() -> Result<()> {
     )?;
     driver.wait_matched()?;
     let _loss = Loss::of_samples(&link.robot, &link.monitor, &stream, 100)?;
-    driver.go()?;
+    driver.start_sending()?;
     std::thread::sleep(Duration::from_secs(10));
     process.write_line("end")?;
     let cases = place.end(&mut process, CONDITION_FAILED)?;
@@ -259,7 +260,7 @@ fn lost_messages_and_a_low_rate_fail_by_the_name_of_the_topic() -> Result<()> {
 
 #[test]
 fn the_status_of_the_command_is_kept() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let place = Place::new(&at_the_sockets_of(&host))?;
     for (script, code) in [
         ("exit 7", 7),
@@ -308,7 +309,7 @@ fn hostile_names_are_escaped_in_every_artefact() -> Result<()> {
 
 #[test]
 fn signals_reach_the_command_and_the_artefacts_are_written() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let place = Place::new(&at_the_sockets_of(&host))?;
     for (signal, code) in [("INT", 42), ("TERM", 43)] {
         let script =
@@ -324,7 +325,7 @@ fn signals_reach_the_command_and_the_artefacts_are_written() -> Result<()> {
 
 #[test]
 fn children_end_with_an_rp_ci_that_is_killed() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let place = Place::new(&at_the_sockets_of(&host))?;
     let script = "sleep 3601 & sleep 3602 & echo began; wait";
     let mut process = place.start(&host, &[], script)?;
@@ -342,7 +343,7 @@ fn children_end_with_an_rp_ci_that_is_killed() -> Result<()> {
 
 #[test]
 fn several_runs_do_not_disturb_each_other_nor_an_installed_agent() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let installed = tempfile::tempdir()?;
     let file = installed.path().join("ros2probe.yaml");
     fs::write(&file, at_the_sockets_of(&host))?;
@@ -380,13 +381,13 @@ fn a_missing_capability_is_reported_before_the_command_runs() -> Result<()> {
         .args(["--", "touch"])
         .arg(&marker)
         .output()?;
-    let said = String::from_utf8(stderr)?;
+    let printed = String::from_utf8(stderr)?;
     ensure!(
-        status.code() == Some(77) && said.lines().count() == 1,
-        "{status}: {said}"
+        status.code() == Some(77) && printed.lines().count() == 1,
+        "{status}: {printed}"
     );
     for part in ["CAP_BPF", "`host`", "`wire`", "sudo setcap"] {
-        ensure!(said.contains(part), "no {part} in {said}");
+        ensure!(printed.contains(part), "no {part} in {printed}");
     }
     ensure!(!marker.exists());
     Ok(())
@@ -394,7 +395,7 @@ fn a_missing_capability_is_reported_before_the_command_runs() -> Result<()> {
 
 #[test]
 fn a_run_with_more_messages_than_the_bag_may_hold_keeps_a_complete_bag() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let place = Place::new(&format!(
         "{}recordings: {{max_bytes: 1048576}}\n",
         at_the_sockets_of(&host)
@@ -422,7 +423,7 @@ fn the_action_runs_rp_ci_with_its_inputs_and_keeps_the_status() -> Result<()> {
     let action: serde_yaml::Value = serde_yaml::from_str(&action)?;
     let step = &action["runs"]["steps"][0];
     let script = step["run"].as_str().context("no script")?;
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let place = Place::new(&at_the_sockets_of(&host))?;
     let input = |name: &str| match name {
         "run" => "source ./env.sh; exit $CODE".to_owned(),
@@ -454,15 +455,19 @@ fn the_action_runs_rp_ci_with_its_inputs_and_keeps_the_status() -> Result<()> {
         command.env(variable, input(name));
     }
     let output = command.output()?;
-    let said = String::from_utf8(output.stderr)?;
-    ensure!(output.status.code() == Some(9), "{}: {said}", output.status);
-    ensure!(place.path("a directory/junit.xml").exists(), "{said}");
+    let printed = String::from_utf8(output.stderr)?;
+    ensure!(
+        output.status.code() == Some(9),
+        "{}: {printed}",
+        output.status
+    );
+    ensure!(place.path("a directory/junit.xml").exists(), "{printed}");
     command.env("RP", "/nonexistent/rp");
     let output = command.output()?;
-    let said = String::from_utf8(output.stdout)?;
+    let printed = String::from_utf8(output.stdout)?;
     ensure!(
-        output.status.code() == Some(127) && said.contains("not installed"),
-        "{said}"
+        output.status.code() == Some(127) && printed.contains("not installed"),
+        "{printed}"
     );
     Ok(())
 }
@@ -479,7 +484,7 @@ fn agent_of(host: &Namespace) -> Result<String> {
 
 #[test]
 fn packets_that_the_agent_dropped_are_a_warning_and_fail_a_strict_run() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     // This ring holds some 500 records, and the robot causes one for each message.
     let place = Place::new("capture: {source: wire, record_ring_bytes: 65536}\n")?;
     let robot = healthy(12)?.replace("--rate 50", "--rate 500");
@@ -499,15 +504,15 @@ fn packets_that_the_agent_dropped_are_a_warning_and_fail_a_strict_run() -> Resul
         harness::run(&format!("kill -CONT {agent}"))?;
         let cases = place.end(&mut process, code)?;
         assert_eq!(cases.failed(), failed);
-        let said = fs::read_to_string(place.path("said"))?;
+        let printed = fs::read_to_string(place.path("said"))?;
         let verdict = match code {
             0 => "rp ci: warning    observation  completeness: the agent dropped ",
             _ => "rp ci: failed     observation  completeness: the agent dropped ",
         };
-        ensure!(said.contains(verdict), "{said}");
+        ensure!(printed.contains(verdict), "{printed}");
         ensure!(
-            said.contains(", with a warning: the agent missed") == (code == 0),
-            "{said}"
+            printed.contains(", with a warning: the agent missed") == (code == 0),
+            "{printed}"
         );
         let junit = fs::read_to_string(place.path("out/junit.xml"))?;
         let output = "<system-out>warning: the agent dropped ";
@@ -520,7 +525,7 @@ fn packets_that_the_agent_dropped_are_a_warning_and_fail_a_strict_run() -> Resul
 
 #[test]
 fn topics_beyond_a_limit_fail_a_strict_run() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let place = Place::new(&format!(
         "{}limits: {{topics: 1}}\n",
         at_the_sockets_of(&host)
@@ -537,15 +542,18 @@ fn topics_beyond_a_limit_fail_a_strict_run() -> Result<()> {
         let options = ["--settle", "2", "--max-lost", "any", option];
         let mut process = place.start(&host, &options, &script)?;
         assert_eq!(place.end(&mut process, code)?.failed(), failed);
-        let said = fs::read_to_string(place.path("said"))?;
-        ensure!(said.contains("limits.topics was reached, and "), "{said}");
+        let printed = fs::read_to_string(place.path("said"))?;
+        ensure!(
+            printed.contains("limits.topics was reached, and "),
+            "{printed}"
+        );
     }
     Ok(())
 }
 
 #[test]
 fn an_agent_that_is_killed_fails_the_run_but_not_the_command() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let place = Place::new(&at_the_sockets_of(&host))?;
     let mut process = place.start(&host, &["--settle", "0"], "echo began; sleep 5; exit 0")?;
     process.wait_for("began", PATIENCE)?;
@@ -555,7 +563,7 @@ fn an_agent_that_is_killed_fails_the_run_but_not_the_command() -> Result<()> {
         failed.contains(&"observation agent".to_owned()),
         "{failed:?}"
     );
-    let said = fs::read_to_string(place.path("said"))?;
-    ensure!(said.contains("signal 9 ended it"), "{said}");
+    let printed = fs::read_to_string(place.path("said"))?;
+    ensure!(printed.contains("signal 9 ended it"), "{printed}");
     Ok(())
 }

@@ -13,8 +13,8 @@ use serde_json::Value;
 
 /// Rate of the messages to the agent's host, in hertz.
 const RATE: f64 = 20.0;
-/// Rate of the messages from it. Cyclone DDS requests an acknowledgement with a message that is 80 ms
-/// or more after the one before, and with no other.
+/// Rate of the messages from it. Cyclone DDS requests an acknowledgement with a message that is 80
+/// ms or more after the one before, and with no other.
 const RATE_BACK: f64 = 5.0;
 /// Maximum time until the agent knows the offset well.
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -93,8 +93,8 @@ fn is_within_bounds(
     for peer in [&mut shifted, &mut listener, &mut back_to, &mut back_from] {
         peer.wait_matched()?;
     }
-    shifted.go()?;
-    back_from.go()?;
+    shifted.start_sending()?;
+    back_from.start_sending()?;
 
     // The bounds hold from the first one on, and become narrow.
     let deadline = SystemTime::now() + PATIENCE;

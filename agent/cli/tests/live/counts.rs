@@ -282,7 +282,7 @@ impl Exchange {
         // Until the agent has classified both endpoints, it reads no ACKNACKs, and samples that are
         // repaired immediately count as reordered.
         std::thread::sleep(Duration::from_millis(500));
-        publisher.go()?;
+        publisher.start_sending()?;
         publisher
             .wait_sent(Duration::from_secs(60))
             .context("the publisher sends")?;
@@ -325,7 +325,7 @@ impl Exchange {
                 self.received.sequences("sub").len(),
                 end.counted(),
             );
-            println!("{}", end.scrape.doubts());
+            println!("{}", end.scrape.doubted_jumps());
         }
     }
 }

@@ -15,7 +15,7 @@ use ros2probe_testing::harness::prometheus::Prometheus;
 use serde_yaml::Value;
 
 /// Queries of panels that rightly return no data on these robots, with the reason.
-const RIGHTLY_EMPTY: [(&str, &str); 20] = [
+const EXPECTED_EMPTY_QUERIES: [(&str, &str); 20] = [
     (
         "robot: Where latency arises B",
         "nothing is sent and received by sockets of one host",
@@ -57,7 +57,7 @@ const RIGHTLY_EMPTY: [(&str, &str); 20] = [
 ];
 
 /// Alerts whose condition holds here. The other alerts are about failing agents and links.
-const TRUE_ALERTS: [&str; 8] = [
+const EXPECTED_ALERTS: [&str; 8] = [
     "Ros2TopicSilent",
     "Ros2TopicNotPublished",
     "Ros2TopicRateBelowContract",
@@ -69,7 +69,7 @@ const TRUE_ALERTS: [&str; 8] = [
 ];
 
 /// Labels that may be empty, which to Prometheus is the same as absent.
-const MAY_BE_EMPTY: [&str; 2] = ["host", "reason"];
+const OPTIONAL_QUERIES: [&str; 2] = ["host", "reason"];
 
 /// A query that must return data.
 struct Question {
@@ -131,10 +131,10 @@ fn every_panel_and_every_rule_has_data_of_two_robots() -> Result<()> {
     }
     ensure!(questions.len() > 120, "{} questions", questions.len());
     let names: BTreeSet<&str> = questions.iter().map(|each| each.name.as_str()).collect();
-    for name in RIGHTLY_EMPTY
+    for name in EXPECTED_EMPTY_QUERIES
         .iter()
         .map(|(name, _)| *name)
-        .chain(TRUE_ALERTS)
+        .chain(EXPECTED_ALERTS)
     {
         ensure!(names.contains(name), "{name} does not exist");
     }
@@ -219,7 +219,7 @@ fn of_dashboard(dashboard: &Dashboard, targets: &[String; 2]) -> Result<Vec<Ques
                     .copied()
                     .filter(|_| panel.targets().len() == 1),
             );
-            let labels = labels.filter(|label| !MAY_BE_EMPTY.contains(label));
+            let labels = labels.filter(|label| !OPTIONAL_QUERIES.contains(label));
             questions.push(Question {
                 expression: resolved(target.expression, &values)
                     .with_context(|| format!("query {index}"))?,
@@ -257,8 +257,10 @@ impl Question {
     fn needs_an_answer(&self) -> bool {
         let name = self.name.as_str();
         let alert = name.starts_with("Ros2");
-        let empty = RIGHTLY_EMPTY.iter().any(|(panel, _)| *panel == name);
-        !empty && (!alert || TRUE_ALERTS.contains(&name))
+        let empty = EXPECTED_EMPTY_QUERIES
+            .iter()
+            .any(|(panel, _)| *panel == name);
+        !empty && (!alert || EXPECTED_ALERTS.contains(&name))
     }
 }
 

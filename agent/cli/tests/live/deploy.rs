@@ -16,7 +16,7 @@ use serde::Deserialize as _;
 use serde_yaml::Value;
 
 /// An empty capability set, as /proc shows it.
-const NOTHING: &str = "0000000000000000";
+const NO_CAPABILITIES: &str = "0000000000000000";
 const OUTAGE: Duration = Duration::from_secs(8);
 /// Maximum gap between samples of a scrape per second, in seconds, on a busy machine.
 const GAP: f64 = 6.0;
@@ -24,7 +24,7 @@ const GAP: f64 = 6.0;
 /// The runtime's seccomp filter and its own setup of the confinement are not covered.
 #[test]
 fn an_agent_confined_by_the_daemon_set_sees_the_whole_node() -> Result<()> {
-    let node = Namespace::alone()?;
+    let node = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let file = |name: &str| -> PathBuf { directory.path().join(name) };
     let manifest = std::fs::read_to_string(deploy().join("kubernetes/ros2probe.yaml"))?;
@@ -81,8 +81,8 @@ fn an_agent_confined_by_the_daemon_set_sees_the_whole_node() -> Result<()> {
     ensure!(failed == Some(0.0), "{failed:?}");
     let status = std::fs::read_to_string(format!("/proc/{}/status", agent.process.pid()))?;
     for line in [
-        format!("CapEff:\t{NOTHING}"),
-        format!("CapPrm:\t{NOTHING}"),
+        format!("CapEff:\t{NO_CAPABILITIES}"),
+        format!("CapPrm:\t{NO_CAPABILITIES}"),
         "NoNewPrivs:\t1".to_owned(),
     ] {
         ensure!(

@@ -56,7 +56,7 @@ fn a_reliable_subscriber_of_a_best_effort_publisher_is_reported_and_gets_nothing
             by_reliability(page) == 1.0 && pairs(page) == 1.0
         })?;
 
-        talker.go()?;
+        talker.start_sending()?;
         talker.wait_sent(PATIENCE)?;
         let deadline = Instant::now() + PATIENCE;
         while listener.log()?.sequences("sub").is_empty() {

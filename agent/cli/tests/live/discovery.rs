@@ -24,52 +24,52 @@ const SILENT: usize = NODES / 2;
 
 #[test]
 fn all_sixteen_fast_dds_nodes_are_shown_in_each_of_ten_starts() -> Result<()> {
-    all_nodes_are_there_each_time(Stack::Fast)
+    check_all_nodes(Stack::Fast)
 }
 
 #[test]
 fn all_sixteen_cyclone_dds_nodes_are_shown_in_each_of_ten_starts() -> Result<()> {
-    all_nodes_are_there_each_time(Stack::Cyclone)
+    check_all_nodes(Stack::Cyclone)
 }
 
 #[test]
 fn all_sixteen_rust_dds_nodes_are_shown_in_each_of_ten_starts() -> Result<()> {
-    all_nodes_are_there_each_time(Stack::Rust)
+    check_all_nodes(Stack::Rust)
 }
 
 #[test]
 fn an_agent_that_starts_after_half_of_the_fast_dds_nodes_shows_all() -> Result<()> {
-    late_agent_shows_all_nodes_each_time(Stack::Fast)
+    check_late_agent(Stack::Fast)
 }
 
 #[test]
 fn an_agent_that_starts_after_half_of_the_cyclone_dds_nodes_shows_all() -> Result<()> {
-    late_agent_shows_all_nodes_each_time(Stack::Cyclone)
+    check_late_agent(Stack::Cyclone)
 }
 
 #[test]
 fn an_agent_that_starts_after_half_of_the_rust_dds_nodes_shows_all() -> Result<()> {
-    late_agent_shows_all_nodes_each_time(Stack::Rust)
+    check_late_agent(Stack::Rust)
 }
 
 #[test]
 fn a_late_agent_shows_unknown_writers_with_their_rate() -> Result<()> {
     // Each stack is on a separate link, so that none waits for the others.
     std::thread::scope(|scope| {
-        let stacks = Stack::ALL.map(|stack| scope.spawn(move || late_agent_shows_rate(stack)));
+        let stacks = Stack::ALL.map(|stack| scope.spawn(move || late_agent_ratio(stack)));
         stacks
             .into_iter()
             .try_for_each(|stack| stack.join().unwrap_or_else(|panic| resume_unwind(panic)))
     })
 }
 
-fn late_agent_shows_rate(stack: Stack) -> Result<()> {
+fn late_agent_ratio(stack: Stack) -> Result<()> {
     let link = Link::new()?;
     let stream = Stream {
         rate: 100.0,
         ..Stream::small(1500)
     };
-    let (mut publisher, _subscriber) = talking(&link, stack, &stream)?;
+    let (mut publisher, _subscriber) = start_talker_pair(&link, stack, &stream)?;
     std::thread::sleep(Duration::from_secs(1));
     let watcher = Watcher::start(&link.monitor)?;
     let unknown = |page: &Scrape| page.sum("ros2_unknown_writers", &[]) == 1.0;
@@ -105,7 +105,7 @@ fn one_topic_name_in_two_domains_counts_as_two_topics() -> Result<()> {
             domain,
             ..Stream::small(count)
         };
-        pairs.push(talking(&link, stack, &stream)?);
+        pairs.push(start_talker_pair(&link, stack, &stream)?);
     }
     let nodes = |page: &Scrape| {
         let of = |domain| page.sum("ros2_nodes", &[("domain_id", domain)]) == 2.0;
@@ -206,7 +206,7 @@ fn stopped_nodes_vanish_immediately_and_killed_ones_when_their_lease_ends() -> R
     Ok(())
 }
 
-fn all_nodes_are_there_each_time(stack: Stack) -> Result<()> {
+fn check_all_nodes(stack: Stack) -> Result<()> {
     let link = Link::new()?;
     let mut watchers = watchers(&link)?;
     for start in 0..STARTS {
@@ -223,7 +223,7 @@ fn all_nodes_are_there_each_time(stack: Stack) -> Result<()> {
     Ok(())
 }
 
-fn late_agent_shows_all_nodes_each_time(stack: Stack) -> Result<()> {
+fn check_late_agent(stack: Stack) -> Result<()> {
     let link = Link::new()?;
     for start in 0..STARTS {
         let began = Instant::now();
@@ -316,7 +316,7 @@ impl<'a> Robot<'a> {
             for (number, peer) in there {
                 // The Rust peer cannot end while it waits for the start.
                 if number % 2 == 0 {
-                    peer.go()?;
+                    peer.start_sending()?;
                 }
                 peer.process.signal("TERM")?;
                 ending.push(peer);
@@ -390,7 +390,7 @@ impl<'a> Watcher<'a> {
 }
 
 /// A publisher on the robot that sends to a subscriber on the monitor.
-fn talking(link: &Link, stack: Stack, stream: &Stream) -> Result<(Peer, Peer)> {
+fn start_talker_pair(link: &Link, stack: Stack, stream: &Stream) -> Result<(Peer, Peer)> {
     let mut subscriber = Peer::start(
         &link.monitor,
         stack,
@@ -401,7 +401,7 @@ fn talking(link: &Link, stack: Stack, stream: &Stream) -> Result<(Peer, Peer)> {
     let mut publisher = Peer::start(&link.robot, stack, Role::Publisher, stream, &["/talker"])?;
     subscriber.wait_matched()?;
     publisher.wait_matched()?;
-    publisher.go()?;
+    publisher.start_sending()?;
     Ok((publisher, subscriber))
 }
 

@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context as _, Result, anyhow, ensure};
 use clock::ClockStep;
 use ros2probe_testing::forged::crowd::{Crowd, Graph, Scale, Tally};
-use ros2probe_testing::forged::{Carrier, Sender, Talker, introduce, talk};
+use ros2probe_testing::forged::{Carrier, Sender, Talker, introduce, send_sizes};
 use ros2probe_testing::harness;
 use ros2probe_testing::harness::agent::{
     Agent, METRICS, ON_THE_WIRE, Scrape, at_the_sockets_of, get,
@@ -33,9 +33,9 @@ const PATIENCE: Duration = Duration::from_secs(60);
 const WARM_UP: f64 = 0.15;
 /// Maximum rise of memory after the warm-up. The allocator levels off in half an hour, although the
 /// tables stay the same size (`docs/endurance.md`).
-const FILLING: f64 = 0.06;
+const MAX_MEMORY_RISE: f64 = 0.06;
 /// Part of the run after which the allocator has levelled off.
-const LEVEL: f64 = 0.5;
+const LEVEL_RATIO: f64 = 0.5;
 /// Maximum rise of memory after the allocator has levelled off.
 const GROWTH: f64 = 0.02;
 
@@ -62,13 +62,17 @@ fn an_hour_of_graph_changes_leaves_the_graph_correct_and_the_memory_flat() -> Re
         .robot
         .hold(|| Sender::between(&link.robot, &link.monitor))??;
     let long = soak::long();
-    let mut crowd = Crowd::new(sender, changing(long.is_some()));
+    let mut crowd = Crowd::new(sender, changing_crowd(long.is_some()));
     let agents = [("on the wire", &wire), ("at the sockets", &sockets)];
     for curve in &observed(agents, &mut crowd, long)? {
         let last = curve.needs.last().context("nothing was drawn")?;
-        eprintln!("{}: {} births; at the end {last}", curve.name, crowd.born());
+        eprintln!(
+            "{}: {} births; at the end {last}",
+            curve.name,
+            crowd.participants_created()
+        );
         if let Some(long) = long {
-            memory_is_flat(curve, long)?;
+            check_flat_memory(curve, long)?;
         }
     }
     // By default, at most 1000 topics are measured, and the agent counts further ones.
@@ -80,7 +84,7 @@ fn an_hour_of_graph_changes_leaves_the_graph_correct_and_the_memory_flat() -> Re
 }
 
 /// A crowd whose participants and endpoints keep changing.
-fn changing(is_long: bool) -> Scale {
+fn changing_crowd(is_long: bool) -> Scale {
     if is_long {
         // The default limit is 1000; participants whose lease has just ended still count.
         Scale {
@@ -130,13 +134,13 @@ fn observed(
     })
 }
 
-fn memory_is_flat(curve: &Curve, long: Duration) -> Result<()> {
+fn check_flat_memory(curve: &Curve, long: Duration) -> Result<()> {
     curve.is_level()?;
     let growth = |part: f64| {
         let growth = curve.growth(long.as_secs_f64() * part);
         growth.context("too short for a slope")
     };
-    let ((slope, end), (filling_slope, filling)) = (growth(LEVEL)?, growth(WARM_UP)?);
+    let ((slope, end), (filling_slope, filling)) = (growth(LEVEL_RATIO)?, growth(WARM_UP)?);
     let text = format!(
         "memory in the second half {:+.2} % by slope, {:+.2} % from begin to end; from minute {:.0} on \
          {:+.2} and {:+.2} %; graph equal at every checkpoint",
@@ -148,7 +152,10 @@ fn memory_is_flat(curve: &Curve, long: Duration) -> Result<()> {
     );
     soak::outcome(&format!("changing graph, {}", curve.name), &text)?;
     ensure!(
-        slope <= GROWTH && end <= GROWTH && filling_slope <= FILLING && filling <= FILLING,
+        slope <= GROWTH
+            && end <= GROWTH
+            && filling_slope <= MAX_MEMORY_RISE
+            && filling <= MAX_MEMORY_RISE,
         "{}: {text}",
         curve.name
     );
@@ -163,24 +170,24 @@ fn an_agent_stopped_for_seconds_keeps_all_participants_and_counts_dropped_frames
         &link,
         "watch: [/**]\ncapture: {source: wire, ring_bytes: 1048576}\n",
     )?;
-    let mut crowd = Crowd::new(robot.sender()?, few(&[(4, 100)]));
+    let mut crowd = Crowd::new(robot.sender()?, small_crowd(&[(4, 100)]));
     crowd.live(Duration::from_secs(2))?;
     let views = &mut Views::of(&[&robot.agent]);
     views.compare(&mut crowd)?;
     let pauses = soak::long().map_or(&[5][..], |_| &[5, 60]);
     for pause in pauses.iter().copied().map(Duration::from_secs) {
         // The crowd rests until participants that left silently have expired.
-        crowd.rest(Duration::from_secs(5))?;
-        let expired = robot.expired()?;
+        crowd.idle(Duration::from_secs(5))?;
+        let expired = robot.expired_participants()?;
         robot.agent.process.signal("STOP")?;
-        crowd.rest(pause)?;
+        crowd.idle(pause)?;
         // On a busy machine the leases alone do not fill the ring.
         crowd.repeat()?;
         robot.agent.process.signal("CONT")?;
         let woke = Instant::now();
         robot.wait_ready()?;
         let ready = woke.elapsed();
-        crowd.rest(Duration::from_secs(1))?;
+        crowd.idle(Duration::from_secs(1))?;
         let page = robot
             .agent
             .scrape_until("a fresh page with what was dropped", |page| {
@@ -188,7 +195,7 @@ fn an_agent_stopped_for_seconds_keeps_all_participants_and_counts_dropped_frames
             })?;
         let missed = dropped(&page);
         ensure!(
-            robot.expired()? == expired,
+            robot.expired_participants()? == expired,
             "somebody is believed gone: {}",
             page.0
         );
@@ -219,25 +226,25 @@ fn an_overloaded_agent_counts_dropped_records_and_is_exact_afterwards() -> Resul
     let mut sender = robot.sender()?;
     introduce(&real, &mut sender)?;
     introduce(&flood, &mut sender)?;
-    talk(&mut real, &mut sender, [320; 100])?;
+    send_sizes(&mut real, &mut sender, [320; 100])?;
     robot.agent.settled_scrape("/real", 100)?;
     // The agent gets 2 ms of CPU in 100 ms, which is less than it needs.
-    let brake = Brake::new(&robot.agent)?;
+    let brake = CpuLimit::new(&robot.agent)?;
     let began = Instant::now();
     let span = Duration::from_secs(soak::long().map_or(3, |_| 30));
     while began.elapsed() < span {
         // The leases of both are shorter than a long flood.
-        sender.carry(&real.participant())?;
-        sender.carry(&flood.participant())?;
+        sender.send(&real.participant())?;
+        sender.send(&flood.participant())?;
         for _ in 0..200 {
-            sender.carry(&flood.sample(1200))?;
+            sender.send(&flood.sample(1200))?;
         }
         std::thread::sleep(Duration::from_millis(10));
     }
     // A stopped agent reads no record.
     robot.agent.process.signal("STOP")?;
     for _ in 0..2000 {
-        sender.carry(&flood.sample(1200))?;
+        sender.send(&flood.sample(1200))?;
     }
     robot.agent.process.signal("CONT")?;
     let held = robot.readiness()?;
@@ -260,7 +267,7 @@ fn an_overloaded_agent_counts_dropped_records_and_is_exact_afterwards() -> Resul
         counted + lost <= sent && counted + missed >= sent,
         "{counted} and {lost} lost of {sent}"
     );
-    talk(&mut real, &mut sender, [320; 400])?;
+    send_sizes(&mut real, &mut sender, [320; 400])?;
     let page = robot.agent.settled_scrape("/real", 500)?;
     let exact = [
         topic(&page, "ros2_topic_messages_total", "/real"),
@@ -287,7 +294,7 @@ fn fragments_count_once_while_the_mtu_changes() -> Result<()> {
         let stream = scope.spawn(|| -> Result<usize> {
             let mut bytes = 0;
             for size in [320, 1300, 4000, 20_000, 60_000].into_iter().cycle() {
-                talk(&mut talker, &mut sender, [size])?;
+                send_sizes(&mut talker, &mut sender, [size])?;
                 std::thread::sleep(Duration::from_millis(6));
                 bytes += size;
                 if stop.load(Ordering::Relaxed) {
@@ -337,7 +344,7 @@ fn fragments_count_once_while_the_mtu_changes() -> Result<()> {
 #[test]
 fn a_removed_network_namespace_is_reported_and_affects_no_other() -> Result<()> {
     let link = Link::new()?;
-    let other = Namespace::alone()?;
+    let other = Namespace::isolated()?;
     let place = other.network();
     let text = format!(
         "watch: [/**]\ncapture: {{source: wire, network_namespaces: [{}]}}\n",
@@ -347,7 +354,7 @@ fn a_removed_network_namespace_is_reported_and_affects_no_other() -> Result<()> 
     let mut inside = Sender::new(&other, "127.0.0.1:0", "127.0.0.1:7400")?;
     let mut talker = Talker::new(1, "/inside");
     introduce(&talker, &mut inside)?;
-    talk(&mut talker, &mut inside, [320; 50])?;
+    send_sizes(&mut talker, &mut inside, [320; 50])?;
     robot.agent.settled_scrape("/inside", 50)?;
     drop(inside);
     let name = other.name().to_owned();
@@ -360,7 +367,7 @@ fn a_removed_network_namespace_is_reported_and_affects_no_other() -> Result<()> 
     let mut sender = robot.sender()?;
     let mut talker = Talker::new(2, "/outside");
     introduce(&talker, &mut sender)?;
-    talk(&mut talker, &mut sender, [320; 200])?;
+    send_sizes(&mut talker, &mut sender, [320; 200])?;
     let page = robot.agent.settled_scrape("/outside", 200)?;
     let counted = |topic| page.sum("ros2_topic_messages_total", &[("topic", topic)]);
     ensure!(
@@ -401,29 +408,32 @@ fn clock_steps_forward_and_back_leave_leases_rates_and_readiness_correct() -> Re
     };
     let link = Link::new()?;
     let robot = Robot::start(&link, &format!("watch: [/**]\n{ON_THE_WIRE}"))?;
-    let mut crowd = Crowd::new(robot.sender()?, few(&[(4, 100)]));
+    let mut crowd = Crowd::new(robot.sender()?, small_crowd(&[(4, 100)]));
     crowd.live(Duration::from_secs(4))?;
     let views = &mut Views::of(&[&robot.agent]);
     views.compare(&mut crowd)?;
     for seconds in [step, -step] {
-        crowd.rest(Duration::from_secs(5))?;
-        let expired = robot.expired()?;
+        crowd.idle(Duration::from_secs(5))?;
+        let expired = robot.expired_participants()?;
         let set = ClockStep::by(seconds)?;
-        crowd.rest(Duration::from_millis(1200))?;
+        crowd.idle(Duration::from_millis(1200))?;
         let page = robot.agent.scrape()?;
         let shown = page.sum("ros2probe_snapshot_age_seconds", &[]);
         let rate = page
             .samples("ros2_topic_rate_hertz", &[])
             .fold(0.0, f64::max);
         drop(set);
-        crowd.rest(Duration::from_millis(1500))?;
+        crowd.idle(Duration::from_millis(1500))?;
         let ready = robot.readiness()?;
         ensure!(
             (0.0..5.0).contains(&shown) && rate < 1000.0,
             "{shown} s old, {rate} Hz"
         );
         ensure!(ready == "200", "{ready}");
-        ensure!(robot.expired()? == expired, "leases ended by a clock");
+        ensure!(
+            robot.expired_participants()? == expired,
+            "leases ended by a clock"
+        );
         crowd.live(Duration::from_secs(1))?;
         views.compare(&mut crowd)?;
         let text = "no lease ended, no absurd rate, ready, events and messages exact";
@@ -434,7 +444,7 @@ fn clock_steps_forward_and_back_leave_leases_rates_and_readiness_correct() -> Re
 }
 
 /// Returns a crowd of a few dozen participants with these leases.
-fn few(leases: &'static [(u64, u64)]) -> Scale {
+fn small_crowd(leases: &'static [(u64, u64)]) -> Scale {
     Scale {
         participants: 60,
         life: Duration::from_secs(20),
@@ -478,7 +488,7 @@ impl<'a> Robot<'a> {
     }
 
     /// Returns the number of participants that the agent removed at the end of their leases.
-    fn expired(&self) -> Result<f64> {
+    fn expired_participants(&self) -> Result<f64> {
         let labels = [("entity", "participant"), ("event", "expired")];
         Ok(self
             .agent
@@ -512,13 +522,13 @@ impl<'a> Robot<'a> {
 }
 
 /// Limits a process to two hundredths of a CPU.
-struct Brake(PathBuf);
+struct CpuLimit(PathBuf);
 
-impl Brake {
-    fn new(agent: &Agent<'_>) -> Result<Brake> {
+impl CpuLimit {
+    fn new(agent: &Agent<'_>) -> Result<CpuLimit> {
         let group = format!("/sys/fs/cgroup/cpu/r2p-{}-brake", std::process::id());
         std::fs::create_dir(&group).with_context(|| format!("cannot create {group}"))?;
-        let brake = Brake(group.into());
+        let brake = CpuLimit(group.into());
         std::fs::write(brake.0.join("cpu.cfs_quota_us"), "2000")?;
         std::fs::write(
             brake.0.join("cgroup.procs"),
@@ -528,7 +538,7 @@ impl Brake {
     }
 }
 
-impl Drop for Brake {
+impl Drop for CpuLimit {
     fn drop(&mut self) {
         let above = self.0.with_file_name("cgroup.procs");
         let own = std::fs::read_to_string(self.0.join("cgroup.procs")).unwrap_or_default();

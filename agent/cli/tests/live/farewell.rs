@@ -22,7 +22,7 @@ fn the_last_samples_before_a_goodbye_are_counted() -> Result<()> {
     let (host, role) = (&link.robot, Role::Publisher);
     let mut publisher = Peer::start(host, Stack::Cyclone, role, &stream, &["/imu_driver"])?;
     publisher.wait_matched()?;
-    publisher.go()?;
+    publisher.start_sending()?;
     std::thread::sleep(Duration::from_secs(1));
     publisher.process.terminate()?;
     let sent = publisher.log()?.sequences("pub").len();

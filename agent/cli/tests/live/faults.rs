@@ -28,7 +28,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, ensure};
 use ros2probe_capture::netns;
-use ros2probe_testing::forged::{Carrier as _, Sender, Talker, talk};
+use ros2probe_testing::forged::{Carrier as _, Sender, Talker, send_sizes};
 use ros2probe_testing::harness;
 use ros2probe_testing::harness::agent::{Agent, Scrape};
 use ros2probe_testing::harness::network::{Link, Namespace};
@@ -46,34 +46,34 @@ const REPEAT: Duration = Duration::from_secs(3);
 const ENDING: Duration = Duration::from_secs(8);
 
 /// An agent on a separate host, with a directory for its files.
-struct Scene<'a> {
+struct FaultBench<'a> {
     agent: Agent<'a>,
     log: PathBuf,
 }
 
-impl<'a> Scene<'a> {
+impl<'a> FaultBench<'a> {
     /// Starts the agent after the words of another command, with its log in a file.
     fn start(
         host: &'a Namespace,
         directory: &TempDir,
         configuration: &str,
         words: &[&str],
-    ) -> Result<Scene<'a>> {
+    ) -> Result<FaultBench<'a>> {
         let log = directory.path().join("log");
         let errors = std::fs::File::options()
             .create(true)
             .append(true)
             .open(&log)?;
-        Scene::start_saying(host, directory, configuration, words, errors.into())
+        FaultBench::start_until_output(host, directory, configuration, words, errors.into())
     }
 
-    fn start_saying(
+    fn start_until_output(
         host: &'a Namespace,
         directory: &TempDir,
         configuration: &str,
         words: &[&str],
         errors: Stdio,
-    ) -> Result<Scene<'a>> {
+    ) -> Result<FaultBench<'a>> {
         let file = directory.path().join("ros2probe.yaml");
         std::fs::write(&file, configuration)?;
         let mut enter: Vec<String> = words.iter().map(|word| (*word).to_owned()).collect();
@@ -81,7 +81,7 @@ impl<'a> Scene<'a> {
         let process = launch(&enter, &file, errors)?;
         let mut agent = Agent { process, host };
         agent.wait_ready(PATIENCE)?;
-        Ok(Scene {
+        Ok(FaultBench {
             agent,
             log: directory.path().join("log"),
         })
@@ -156,14 +156,14 @@ impl Counted {
         let talker = Talker::new(number, &topic);
         let mut sender = Sender::between(&link.monitor, &link.robot)?;
         for message in talker.introduction(node) {
-            sender.carry(&message)?;
+            sender.send(&message)?;
         }
         let mut repeater = Sender::between(&link.monitor, &link.robot)?;
         let announcement = talker.participant();
         let (stop, stopped) = std::sync::mpsc::channel();
         std::thread::spawn(move || {
             while stopped.recv_timeout(REPEAT) == Err(RecvTimeoutError::Timeout) {
-                let _ = repeater.carry(&announcement);
+                let _ = repeater.send(&announcement);
             }
         });
         Ok(Counted {
@@ -175,9 +175,9 @@ impl Counted {
         })
     }
 
-    fn talk(&mut self, size: usize, count: usize) -> Result<()> {
+    fn send_samples(&mut self, size: usize, count: usize) -> Result<()> {
         self.sent += count as u64;
-        talk(
+        send_sizes(
             &mut self.talker,
             &mut self.sender,
             std::iter::repeat_n(size, count),
@@ -197,7 +197,7 @@ impl Counted {
             (counted, lost) == (self.sent as f64, 0.0),
             "{counted} of {} counted, {lost} lost: {}",
             self.sent,
-            page.doubts()
+            page.doubted_jumps()
         );
         Ok(())
     }

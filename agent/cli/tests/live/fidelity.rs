@@ -21,7 +21,7 @@ mod experiment;
 mod repair;
 
 use anyhow::{Result, ensure};
-use experiment::{Experiment, Size, Trouble};
+use experiment::{Experiment, InjectedFault, Size};
 use repair::Repair;
 use ros2probe_testing::harness::peer::Stack;
 
@@ -102,15 +102,15 @@ fn losses_of_two_rust_dds_subscribers_are_reported_separately() -> Result<()> {
 
 fn one_subscriber(stack: Stack, size: Size) -> Result<()> {
     let mut troubles = vec![
-        Trouble::Nothing,
-        Trouble::Datagrams(10),
-        Trouble::Datagrams(20),
+        InjectedFault::Nothing,
+        InjectedFault::Datagrams(10),
+        InjectedFault::Datagrams(20),
     ];
     // RustDDS sends no datagram that a frame cannot hold.
     if size != Size::B320 && stack != Stack::Rust {
-        troubles.push(Trouble::Fragments(20));
+        troubles.push(InjectedFault::Fragments(20));
     }
-    troubles.push(Trouble::Stops);
+    troubles.push(InjectedFault::Stops);
     check(&Experiment {
         stack,
         size,
@@ -122,14 +122,14 @@ fn one_subscriber(stack: Stack, size: Size) -> Result<()> {
 fn two_subscribers(stack: Stack) -> Result<()> {
     // RustDDS sends samples to a multicast address, so one datagram serves both subscribers.
     let on_the_link = match stack {
-        Stack::Rust => Trouble::Datagrams(20),
-        _ => Trouble::DatagramsToTheLast(20),
+        Stack::Rust => InjectedFault::Datagrams(20),
+        _ => InjectedFault::DatagramsToTheLast(20),
     };
     check(&Experiment {
         stack,
         size: Size::B320,
         subscribers: 2,
-        troubles: vec![Trouble::Nothing, on_the_link, Trouble::Stops],
+        troubles: vec![InjectedFault::Nothing, on_the_link, InjectedFault::Stops],
     })
 }
 

@@ -14,7 +14,7 @@ use ros2probe_testing::harness::dissection::{Content, Dissection};
 use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream, pair};
 use ros2probe_testing::harness::usage::Usage;
-use ros2probe_testing::viewer::{News, PATIENCE, SUBPROTOCOLS, Viewer, open};
+use ros2probe_testing::viewer::{PATIENCE, SUBPROTOCOLS, ServerMessage, Viewer, open};
 use tempfile::TempDir;
 
 use crate::browser::player::watch;
@@ -70,15 +70,15 @@ fn subscribe(scene: &Scene<'_>, viewer: &mut Viewer) -> Result<u32> {
 
 #[test]
 fn payloads_of_fast_dds_reach_a_viewer_unchanged() -> Result<()> {
-    payloads_are_as_sent(Stack::Fast, 2_720_000)
+    check_payloads(Stack::Fast, 2_720_000)
 }
 
 #[test]
 fn payloads_of_cyclone_dds_reach_a_viewer_unchanged() -> Result<()> {
-    payloads_are_as_sent(Stack::Cyclone, 644_000)
+    check_payloads(Stack::Cyclone, 644_000)
 }
 
-fn payloads_are_as_sent(stack: Stack, size: usize) -> Result<()> {
+fn check_payloads(stack: Stack, size: usize) -> Result<()> {
     let link = Link::new()?;
     let configuration = format!("{}watch: []\n", at_the_sockets_of(&link.robot));
     let scene = Scene::start(&link.robot, &configuration)?;
@@ -101,7 +101,7 @@ fn payloads_are_as_sent(stack: Stack, size: usize) -> Result<()> {
         channel.schema
     );
     let pattern: Vec<u8> = (8..size).map(pattern).collect();
-    publisher.go()?;
+    publisher.start_sending()?;
     let mut received = BTreeMap::new();
     let mut reported = 0;
     let deadline = Instant::now() + 3 * PATIENCE;
@@ -112,7 +112,7 @@ fn payloads_are_as_sent(stack: Stack, size: usize) -> Result<()> {
             received.keys()
         );
         match viewer.next_within(PATIENCE)? {
-            Some(News::Data(data)) if data.subscription == id => {
+            Some(ServerMessage::Data(data)) if data.subscription == id => {
                 ensure!(
                     data.payload.len() == size,
                     "{} of {size}",
@@ -124,12 +124,12 @@ fn payloads_are_as_sent(stack: Stack, size: usize) -> Result<()> {
                     "{number} twice"
                 );
             }
-            Some(News::Status(status)) if status.message.contains("too slowly") => {
+            Some(ServerMessage::Status(status)) if status.message.contains("too slowly") => {
                 let count = status.message.split(' ').next().unwrap_or_default();
                 reported = count.parse()?;
             }
-            Some(News::Channels | News::Data(_)) => {}
-            news => bail!("{news:?} after {:?}", received.keys()),
+            Some(ServerMessage::Channels | ServerMessage::Data(_)) => {}
+            server_message => bail!("{server_message:?} after {:?}", received.keys()),
         }
     }
     publisher.wait_sent(PATIENCE)?;
@@ -162,7 +162,8 @@ fn payloads_are_as_sent(stack: Stack, size: usize) -> Result<()> {
     if stack == Stack::Cyclone {
         // The channel vanishes with the topic, once the lease of the killed nodes ends.
         drop((publisher, subscriber));
-        let is_gone = |viewer: &Viewer, _: &News| viewer.channel(TOPIC).is_none().then_some(());
+        let is_gone =
+            |viewer: &Viewer, _: &ServerMessage| viewer.channel(TOPIC).is_none().then_some(());
         viewer.wait_for("end of the channel", is_gone)?;
     }
     Ok(())
@@ -185,7 +186,7 @@ fn the_public_client_decodes_every_channel_of_the_demo_robot() -> Result<()> {
 #[test]
 fn a_slow_or_killed_viewer_affects_no_other_viewer_and_no_capture() -> Result<()> {
     const MESSAGES: u64 = 120;
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let configuration = format!(
         "{}watch: []\nlimits: {{payload_bytes: 12582912}}\n",
         at_the_sockets_of(&host)
@@ -213,16 +214,16 @@ fn a_slow_or_killed_viewer_affects_no_other_viewer_and_no_capture() -> Result<()
                 let mut numbers = Vec::new();
                 while numbers.len() as u64 != MESSAGES {
                     match viewer.next_within(PATIENCE)? {
-                        Some(News::Data(data)) => numbers.push(number(&data.payload)?),
-                        Some(News::Channels) => {}
-                        news => bail!("{news:?} after {numbers:?}"),
+                        Some(ServerMessage::Data(data)) => numbers.push(number(&data.payload)?),
+                        Some(ServerMessage::Channels) => {}
+                        server_message => bail!("{server_message:?} after {numbers:?}"),
                     }
                 }
                 Ok((numbers, viewer))
             })
         })
         .collect();
-    publisher.go()?;
+    publisher.start_sending()?;
     std::thread::sleep(Duration::from_millis(500));
     // The kernel closes the sockets of a killed process in the same way: without a close frame, and
     // with unread data.
@@ -240,8 +241,8 @@ fn a_slow_or_killed_viewer_affects_no_other_viewer_and_no_capture() -> Result<()
     let mut reported = 0;
     while numbers.len() as u64 + reported != MESSAGES {
         match slow.next_within(PATIENCE)? {
-            Some(News::Data(data)) => ensure!(numbers.insert(number(&data.payload)?)),
-            Some(News::Status(status)) => {
+            Some(ServerMessage::Data(data)) => ensure!(numbers.insert(number(&data.payload)?)),
+            Some(ServerMessage::Status(status)) => {
                 ensure!(
                     status.level == 1 && status.message.ends_with("of /points"),
                     "{status:?}"
@@ -253,8 +254,11 @@ fn a_slow_or_killed_viewer_affects_no_other_viewer_and_no_capture() -> Result<()
                     .unwrap_or_default()
                     .parse()?;
             }
-            Some(News::Channels) => {}
-            news => bail!("{news:?} after {} and {reported} reported", numbers.len()),
+            Some(ServerMessage::Channels) => {}
+            server_message => bail!(
+                "{server_message:?} after {} and {reported} reported",
+                numbers.len()
+            ),
         }
     }
     ensure!(
@@ -271,7 +275,7 @@ fn a_slow_or_killed_viewer_affects_no_other_viewer_and_no_capture() -> Result<()
     ensure!(
         page.sum("ros2_topic_messages_total", &label) == MESSAGES as f64,
         "{}",
-        page.doubts()
+        page.doubted_jumps()
     );
     ensure!(page.sum("ros2_topic_lost_messages_total", &label) == 0.0);
     let dropped = page.sum("ros2probe_foxglove_dropped_messages_total", &[]);
@@ -331,15 +335,15 @@ fn a_viewer_of_all_topics_causes_no_packet_of_the_robot() -> Result<()> {
         }
         let mut ports = publisher.process.udp_ports()?;
         ports.extend(subscriber.process.udp_ports()?);
-        publisher.go()?;
+        publisher.start_sending()?;
         // The viewer receives while the publisher sends, so that the recordings of both runs end
         // equally late.
         if let Some(viewer) = &mut viewer {
             let mut count = 0;
-            viewer.wait_for("messages", |viewer, news| {
+            viewer.wait_for("messages", |viewer, server_message| {
                 let is_message = |id| viewer.channels[&viewer.subscriptions[&id]].topic == "/imu";
                 count +=
-                    u32::from(matches!(news, News::Data(data) if is_message(data.subscription)));
+                    u32::from(matches!(server_message, ServerMessage::Data(data) if is_message(data.subscription)));
                 (count > 100).then_some(())
             })?;
             ensure!(
@@ -350,7 +354,7 @@ fn a_viewer_of_all_topics_causes_no_packet_of_the_robot() -> Result<()> {
         }
         publisher.wait_sent(PATIENCE)?;
         std::thread::sleep(capture::SETTLE);
-        sent.push(what_was_sent(&recording.finish()?, &ports)?);
+        sent.push(sent_payloads(&recording.finish()?, &ports)?);
     }
     let [without, with] = sent.as_slice() else {
         bail!("{} runs", sent.len());
@@ -363,7 +367,7 @@ fn a_viewer_of_all_topics_causes_no_packet_of_the_robot() -> Result<()> {
     Ok(())
 }
 
-fn what_was_sent(recording: &Path, ports: &BTreeSet<u16>) -> Result<Sent> {
+fn sent_payloads(recording: &Path, ports: &BTreeSet<u16>) -> Result<Sent> {
     let frames = Dissection::read(recording)?.frames;
     let mut sent = Sent {
         announcements: BTreeSet::new(),
@@ -425,7 +429,7 @@ fn the_cost_of_a_viewer_is_measured_beside_the_subscriber_of_a_bridge() -> Resul
         ..Stream::point_cloud(2_720_000, 20 * 150)
     };
     let (mut publisher, _subscriber) = pair(&link.robot, &link.monitor, Stack::Cyclone, &stream)?;
-    publisher.go()?;
+    publisher.start_sending()?;
     std::thread::sleep(Duration::from_secs(2));
     for round in 1..=ROUNDS {
         for watcher in ["nothing", "one viewer", "a subscriber in C++"] {
@@ -482,7 +486,7 @@ fn count(mut viewer: Viewer, span: Duration) -> Result<(u64, u64)> {
     let deadline = Instant::now() + span;
     let (mut messages, mut bytes) = (0, 0);
     while Instant::now() < deadline {
-        if let Some(News::Data(data)) = viewer.next_within(Duration::from_millis(200))? {
+        if let Some(ServerMessage::Data(data)) = viewer.next_within(Duration::from_millis(200))? {
             messages += 1;
             bytes += data.payload.len() as u64;
         }

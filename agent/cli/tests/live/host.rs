@@ -8,7 +8,7 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, bail, ensure};
-use ros2probe_testing::forged::{Sender, Talker, introduce, talk};
+use ros2probe_testing::forged::{Sender, Talker, introduce, send_sizes};
 use ros2probe_testing::harness::agent::{Agent, Scrape, at_the_sockets_of};
 use ros2probe_testing::harness::cgroup;
 use ros2probe_testing::harness::network::{Link, Namespace};
@@ -46,7 +46,7 @@ fn the_demo_robot_is_seen_completely_at_its_sockets() -> Result<()> {
         page.0
     );
     assert_eq!(page.sum("ros2_unknown_writers", &[]), 0.0, "{}", page.0);
-    nothing_was_dropped(&page)
+    check_no_drops(&page)
 }
 
 // Coverage: UDP | Fast DDS 2.9 | - | exact
@@ -83,13 +83,13 @@ fn counted_as_logged(stack: Stack) -> Result<()> {
         for observed in [&robot, &monitor] {
             observed.wait(|page| publishers(page, &stream.topic) == Some(1.0))?;
         }
-        publisher.go()?;
+        publisher.start_sending()?;
         publisher.wait_sent(PATIENCE)?;
         for observed in [&robot, &monitor] {
             // On a busy machine, RustDDS may leave without a goodbye.
             match stack {
                 Stack::Rust => observed.agent.settled_scrape(&stream.topic, stream.count)?,
-                _ => observed.wait(|page| gone(page, &stream.topic))?,
+                _ => observed.wait(|page| wait_removed(page, &stream.topic))?,
             };
         }
         let sent = publisher.log()?.sequences("pub").len() as u64;
@@ -106,9 +106,9 @@ fn counted_as_logged(stack: Stack) -> Result<()> {
                 "{stack:?} {} B on {}, {received} received: {}",
                 stream.size,
                 observed.agent.host.name(),
-                page.doubts()
+                page.doubted_jumps()
             );
-            nothing_was_dropped(&page)?;
+            check_no_drops(&page)?;
         }
     }
     Ok(())
@@ -116,7 +116,7 @@ fn counted_as_logged(stack: Stack) -> Result<()> {
 
 #[test]
 fn a_receiver_is_named_by_process_and_control_group() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let socket = directory.path().join("api.sock");
     let configuration = format!(
@@ -130,7 +130,7 @@ fn a_receiver_is_named_by_process_and_control_group() -> Result<()> {
         ..Stream::small(2000)
     };
     let (mut publisher, subscriber) = pair(&host, &host, Stack::Cyclone, &stream)?;
-    publisher.go()?;
+    publisher.start_sending()?;
     let cgroup = host.cgroup().file_name().context("no name")?;
     let cgroup = format!("/{}", cgroup.display());
     let process_id = subscriber.process.pid().to_string();
@@ -142,11 +142,11 @@ fn a_receiver_is_named_by_process_and_control_group() -> Result<()> {
         ("cgroup", &cgroup),
     ];
     observed.wait(|page| page.value("ros2_subscriber_info", &expected) == Some(1.0))?;
-    the_doctor_finds_them(&host, &socket, subscriber.process.pid())
+    check_doctor(&host, &socket, subscriber.process.pid())
 }
 
 /// Checks the report of `rp doctor` for a host with an agent and two nodes.
-fn the_doctor_finds_them(host: &Namespace, socket: &Path, subscriber: u32) -> Result<()> {
+fn check_doctor(host: &Namespace, socket: &Path, subscriber: u32) -> Result<()> {
     let [program, arguments @ ..] = &host.outside();
     let output = Command::new(program)
         .args(arguments)
@@ -170,7 +170,8 @@ fn the_doctor_finds_them(host: &Namespace, socket: &Path, subscriber: u32) -> Re
     }
     let participants = find("graph", "participants")?["sentence"].as_str();
     // Other participants of this machine may be seen in shared memory.
-    let seen = participants.is_some_and(|said| said.contains("domain 0: 2 Eclipse Cyclone DDS"));
+    let seen =
+        participants.is_some_and(|printed| printed.contains("domain 0: 2 Eclipse Cyclone DDS"));
     assert!(seen, "{participants:?}");
     // Other processes of this machine may be among them.
     let processes = find("processes", "processes")?.to_string();
@@ -182,7 +183,7 @@ fn the_doctor_finds_them(host: &Namespace, socket: &Path, subscriber: u32) -> Re
 }
 
 #[test]
-fn a_mirrored_interface_shows_forwarded_messages_and_counts_nothing_twice() -> Result<()> {
+fn a_mirrored_interface_shows_forwarded_messages_once() -> Result<()> {
     let link = Link::new()?;
     let cgroup = link.monitor.cgroup().display();
     let configuration =
@@ -192,15 +193,15 @@ fn a_mirrored_interface_shows_forwarded_messages_and_counts_nothing_twice() -> R
     let mut sender = Sender::between(&link.robot, &link.monitor)?;
     let mut talker = Talker::new(1, "/forwarded");
     introduce(&talker, &mut sender)?;
-    talk(&mut talker, &mut sender, [320; 200])?;
+    send_sizes(&mut talker, &mut sender, [320; 200])?;
     let stream = Stream {
         topic: "/received".to_owned(),
         ..Stream::small(400)
     };
     let (mut publisher, _subscriber) = pair(&link.robot, &link.monitor, Stack::Cyclone, &stream)?;
-    publisher.go()?;
+    publisher.start_sending()?;
     publisher.wait_sent(PATIENCE)?;
-    let page = observed.wait(|page| gone(page, "/received"))?;
+    let page = observed.wait(|page| wait_removed(page, "/received"))?;
     assert_eq!(count(&page, "messages", "/forwarded"), 200);
     assert_eq!(count(&page, "messages", "/received"), 400);
     assert_eq!(
@@ -220,12 +221,12 @@ fn a_mirrored_interface_shows_forwarded_messages_and_counts_nothing_twice() -> R
         "{}",
         page.0
     );
-    nothing_was_dropped(&page)
+    check_no_drops(&page)
 }
 
 #[test]
 fn by_default_the_agent_captures_at_the_sockets_and_reports_it() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let cgroup = host.cgroup().display();
     let observed = Observed::start(&host, &format!("capture: {{cgroup: {cgroup}}}\n"))?;
     let log = observed.log()?;
@@ -237,7 +238,7 @@ fn by_default_the_agent_captures_at_the_sockets_and_reports_it() -> Result<()> {
 
 #[test]
 fn named_interfaces_select_the_wire_and_the_log_has_the_reason() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let observed = Observed::start(&host, "capture: {interfaces: {exclude: [wlan0]}}\n")?;
     let log = observed.log()?;
     assert!(
@@ -251,7 +252,7 @@ fn named_interfaces_select_the_wire_and_the_log_has_the_reason() -> Result<()> {
 #[test]
 fn without_the_capability_to_attach_the_wire_is_selected_and_the_log_has_the_reason() -> Result<()>
 {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let cgroup = host.cgroup().display();
     let configuration = format!("capture: {{cgroup: {cgroup}}}\n");
     let only = "net_raw,bpf,perfmon";
@@ -288,20 +289,20 @@ fn three_capabilities_suffice_at_the_sockets_and_all_are_dropped_later() -> Resu
     assert!(status.contains("\nCapPrm:\t0000000000000000\n"), "{status}");
     let stream = Stream::small(600);
     let (mut publisher, _subscriber) = pair(&link.robot, &link.monitor, Stack::Cyclone, &stream)?;
-    publisher.go()?;
+    publisher.start_sending()?;
     publisher.wait_sent(PATIENCE)?;
-    let page = observed.wait(|page| gone(page, &stream.topic))?;
+    let page = observed.wait(|page| wait_removed(page, &stream.topic))?;
     assert_eq!(count(&page, "messages", &stream.topic), stream.count);
     // The agent updates the interest map without privilege, so the kernel metered most samples.
     let metered = page.sum("ros2probe_filter_events_total", &[("event", "metered")]);
     assert!(metered > 300.0, "{metered} metered");
     assert_eq!(page.sum("ros2probe_filter_refused_updates_total", &[]), 0.0);
-    nothing_was_dropped(&page)
+    check_no_drops(&page)
 }
 
 #[test]
 fn a_configured_source_that_is_unavailable_is_an_error() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let file = directory.path().join("ros2probe.yaml");
     std::fs::write(&file, "capture: {source: host, cgroup: /proc}\n")?;
@@ -310,18 +311,18 @@ fn a_configured_source_that_is_unavailable_is_an_error() -> Result<()> {
         .args([&network, env!("CARGO_BIN_EXE_rp"), "run", "--config"])
         .arg(&file)
         .output()?;
-    let said = String::from_utf8_lossy(&output.stderr);
+    let printed = String::from_utf8_lossy(&output.stderr);
     assert!(
         !output.status.success()
-            && said.contains("/proc is not a control group of the hierarchy v2"),
-        "{said}"
+            && printed.contains("/proc is not a control group of the hierarchy v2"),
+        "{printed}"
     );
     Ok(())
 }
 
 #[test]
 fn a_container_that_starts_later_is_seen_with_the_default_configuration() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let topic = format!("/container_{}", std::process::id());
     let observed = Observed::start(&host, &format!("watch: [{topic}]\n"))?;
     let stream = Stream {
@@ -330,9 +331,9 @@ fn a_container_that_starts_later_is_seen_with_the_default_configuration() -> Res
         ..Stream::small(200)
     };
     // The container has another network namespace and another control group.
-    let container = Namespace::alone()?;
+    let container = Namespace::isolated()?;
     let (mut publisher, _subscriber) = pair(&container, &container, Stack::Cyclone, &stream)?;
-    publisher.go()?;
+    publisher.start_sending()?;
     publisher.wait_sent(PATIENCE)?;
     observed.wait(|page| count(page, "messages", &topic) == stream.count)?;
     let log = observed.log()?;
@@ -355,12 +356,12 @@ fn two_agents_count_the_same_and_a_killed_one_leaves_no_programs_behind() -> Res
     assert_eq!(cgroup::attached(link.robot.cgroup())?, [4, 4]);
     let stream = Stream::small(400);
     let (mut publisher, _subscriber) = pair(&link.robot, &link.monitor, Stack::Fast, &stream)?;
-    publisher.go()?;
+    publisher.start_sending()?;
     publisher.wait_sent(PATIENCE)?;
     for observed in [&first, &second] {
-        let page = observed.wait(|page| gone(page, &stream.topic))?;
+        let page = observed.wait(|page| wait_removed(page, &stream.topic))?;
         assert_eq!(count(&page, "messages", &stream.topic), stream.count);
-        nothing_was_dropped(&page)?;
+        check_no_drops(&page)?;
     }
     second.agent.process.signal("KILL")?;
     second.agent.process.wait(PATIENCE)?;
@@ -471,7 +472,7 @@ fn count(page: &Scrape, what: &str, topic: &str) -> u64 {
 }
 
 /// Returns whether the topic's publisher appeared and left.
-fn gone(page: &Scrape, topic: &str) -> bool {
+fn wait_removed(page: &Scrape, topic: &str) -> bool {
     publishers(page, topic) == Some(0.0)
 }
 
@@ -479,7 +480,7 @@ fn publishers(page: &Scrape, topic: &str) -> Option<f64> {
     page.value("ros2_topic_publishers", &[("topic", topic)])
 }
 
-fn nothing_was_dropped(page: &Scrape) -> Result<()> {
+fn check_no_drops(page: &Scrape) -> Result<()> {
     for lossless in [
         "ros2probe_capture_dropped_packets_total",
         "ros2probe_records_dropped_total",

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context as _, Result};
 use ros2probe_testing::forged::frames::Wire;
 use ros2probe_testing::forged::storm::{Dice, Storm, forgery};
-use ros2probe_testing::forged::{self, Carrier, Sender, Talker, introduce, talk};
+use ros2probe_testing::forged::{self, Carrier, Sender, Talker, introduce, send_sizes};
 use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE, Scrape, at_the_sockets_of};
 use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
@@ -20,7 +20,7 @@ use ros2probe_testing::local_agent;
 use tempfile::TempDir;
 
 /// A port without a socket on the robot: only the agent observes the storm.
-const NOBODY: u16 = 7399;
+const UNUSED_PORT: u16 = 7399;
 const STORM: Duration = Duration::from_secs(6);
 /// Maximum number of bytes that a storm may add to the agent's memory. With every table full, and
 /// several snapshots and pages in flight, the agent stays within the unit's `MemoryMax`.
@@ -48,20 +48,20 @@ const RECOVERY: Duration = Duration::from_secs(30);
 #[test]
 fn a_storm_of_forged_rtps_leaves_memory_bounded_and_a_real_topic_exact() -> Result<()> {
     let link = Link::new()?;
-    let target = format!("{}:{NOBODY}", link.robot.address());
+    let target = format!("{}:{UNUSED_PORT}", link.robot.address());
     let sender = Sender::new(
         &link.monitor,
         &format!("{}:0", link.monitor.address()),
         &target,
     )?;
-    weather(&link, SILENCE, || Ok(Storm::start(sender, forgery)))
+    start_storm(&link, SILENCE, || Ok(Storm::start(sender, forgery)))
 }
 
 #[test]
 fn a_storm_of_torn_ip_fragments_leaves_memory_bounded_and_a_real_topic_exact() -> Result<()> {
     let link = Link::new()?;
     let mut wire = Wire::new(&link.monitor, &link.robot, "eth0")?;
-    wire.port = NOBODY;
+    wire.port = UNUSED_PORT;
     wire.shuffle = |packets| {
         // Different fragments are missing each time; some overlap or are out of order.
         let lot = packets
@@ -81,39 +81,39 @@ fn a_storm_of_torn_ip_fragments_leaves_memory_bounded_and_a_real_topic_exact() -
         bytes.resize(3000 + dice.pick(50_000) as usize, 0x55);
         bytes
     };
-    weather(&link, SILENCE, || Ok(Storm::start(wire, large)))
+    start_storm(&link, SILENCE, || Ok(Storm::start(wire, large)))
 }
 
 #[test]
 fn a_flood_of_samples_of_a_watched_topic_does_not_affect_other_topics() -> Result<()> {
     let link = Link::new()?;
-    let target = format!("{}:{NOBODY}", link.robot.address());
+    let target = format!("{}:{UNUSED_PORT}", link.robot.address());
     let source = format!("{}:0", link.monitor.address());
     let sender = Sender::new(&link.monitor, &source, &target)?;
-    weather(&link, SILENCE, || Storm::of_samples(sender, "/flood"))
+    start_storm(&link, SILENCE, || Storm::of_samples(sender, "/flood"))
 }
 
 #[test]
 fn forgeries_that_fill_every_table_leave_memory_bounded_and_expire_with_their_leases() -> Result<()>
 {
     let link = Link::new()?;
-    let target = format!("{}:{NOBODY}", link.robot.address());
+    let target = format!("{}:{UNUSED_PORT}", link.robot.address());
     let source = format!("{}:0", link.monitor.address());
     let sender = Sender::new(&link.monitor, &source, &target)?;
     let lease = Duration::from_secs(forged::FINITE_LEASE_SECONDS.into());
-    weather(&link, lease + SILENCE, || {
+    start_storm(&link, lease + SILENCE, || {
         Ok(Storm::of_a_crowd(sender, 2000, 30))
     })
 }
 
 #[test]
 fn a_robot_watched_by_name_that_starts_during_a_flood_is_counted_exactly() -> Result<()> {
-    behind_a_flood(|_| ON_THE_WIRE.to_owned())
+    with_participant_flood(|_| ON_THE_WIRE.to_owned())
 }
 
 #[test]
 fn a_robot_at_the_sockets_that_starts_during_a_flood_is_counted_exactly() -> Result<()> {
-    behind_a_flood(|link| at_the_sockets_of(&link.robot))
+    with_participant_flood(|link| at_the_sockets_of(&link.robot))
 }
 
 #[test]
@@ -132,7 +132,7 @@ fn three_capabilities_suffice_for_an_unprivileged_user() -> Result<()> {
     let mut sender = Sender::between(&link.robot, &link.monitor)?;
     let mut talker = Talker::new(1, "/unprivileged");
     introduce(&talker, &mut sender)?;
-    talk(&mut talker, &mut sender, [320; 500])?;
+    send_sizes(&mut talker, &mut sender, [320; 500])?;
     let page = agent.settled_scrape("/unprivileged", 500)?;
     let counted = page.sum("ros2_topic_messages_total", &[("topic", "/unprivileged")]);
     assert_eq!(counted, 500.0, "{}", page.0);
@@ -145,7 +145,7 @@ fn three_capabilities_suffice_for_an_unprivileged_user() -> Result<()> {
 }
 
 #[test]
-fn shared_memory_that_never_answers_is_reported_and_delays_nothing_else() -> Result<()> {
+fn hanging_shared_memory_is_reported_and_delays_no_other_part() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let file = directory.path().join("ros2probe.yaml");
@@ -172,14 +172,14 @@ fn shared_memory_that_never_answers_is_reported_and_delays_nothing_else() -> Res
     agent.scrape_until("shared memory is not seen", |page| !is_able(page))?;
     eprintln!("it is noticed after {:?}", came.elapsed());
     let reason = agent.request("/readyz").unwrap_err().to_string();
-    let said = "capture.shm: its thread has made no progress for ";
-    assert!(reason.contains(said), "{reason}");
+    let printed = "capture.shm: its thread has made no progress for ";
+    assert!(reason.contains(printed), "{reason}");
 
     // Everything else continues.
     let mut sender = Sender::between(&link.monitor, &link.robot)?;
     let mut talker = Talker::new(1, "/beside");
     introduce(&talker, &mut sender)?;
-    talk(&mut talker, &mut sender, [320; 500])?;
+    send_sizes(&mut talker, &mut sender, [320; 500])?;
     let page = agent.settled_scrape("/beside", 500)?;
     let counted = page.sum("ros2_topic_messages_total", &[("topic", "/beside")]);
     assert_eq!(counted, 500.0, "{}", page.0);
@@ -218,7 +218,7 @@ pub fn start_as(user: u32, capabilities: &str, directory: &TempDir) -> Result<Pa
 
 /// Sends announcements of more participants than the table holds, each every other second as a real
 /// participant does, and starts a robot during the flood.
-fn behind_a_flood(capture: impl Fn(&Link) -> String) -> Result<()> {
+fn with_participant_flood(capture: impl Fn(&Link) -> String) -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let file = directory.path().join("ros2probe.yaml");
@@ -226,7 +226,7 @@ fn behind_a_flood(capture: impl Fn(&Link) -> String) -> Result<()> {
     std::fs::write(&file, configuration)?;
     let agent = Agent::start(&link.robot, env!("CARGO_BIN_EXE_rp"), &file)?;
     // The socket hook sees datagrams only if a socket receives them.
-    let to = format!("{}:{NOBODY}", link.robot.address());
+    let to = format!("{}:{UNUSED_PORT}", link.robot.address());
     let _receiver = link.robot.hold(|| Sender::new(&link.robot, &to, &to))?;
     let from = format!("{}:0", link.monitor.address());
     let sender = Sender::new(&link.monitor, &from, &to)?;
@@ -251,7 +251,7 @@ fn behind_a_flood(capture: impl Fn(&Link) -> String) -> Result<()> {
         page.sum("ros2_topic_publishers", &real) == 1.0
     })?;
     eprintln!("the newcomer is seen after {:?}", came.elapsed());
-    publisher.go()?;
+    publisher.start_sending()?;
     publisher.wait_sent(Duration::from_secs(60))?;
     let page = agent.settled_scrape("/real", stream.count)?;
     let counted = page.sum("ros2_topic_messages_total", &real);
@@ -259,8 +259,8 @@ fn behind_a_flood(capture: impl Fn(&Link) -> String) -> Result<()> {
     assert_eq!(page.sum("ros2_topic_lost_messages_total", &real), 0.0);
 
     let readiness = agent.request("/readyz")?;
-    let said = "ready\ndegraded: at a limit: participants (1000 of 1000, ";
-    assert!(readiness.starts_with(said), "{readiness}");
+    let printed = "ready\ndegraded: at a limit: participants (1000 of 1000, ";
+    assert!(readiness.starts_with(printed), "{readiness}");
     let [program, arguments @ ..] = &link.robot.outside();
     let doctor = Command::new(program)
         .args(arguments)
@@ -278,24 +278,28 @@ fn behind_a_flood(capture: impl Fn(&Link) -> String) -> Result<()> {
 struct Paced(Sender);
 
 impl Carrier for Paced {
-    fn carry(&mut self, payload: &[u8]) -> Result<()> {
+    fn send(&mut self, payload: &[u8]) -> Result<()> {
         std::thread::sleep(Duration::from_micros(400));
-        self.0.carry(payload)
+        self.0.send(payload)
     }
 }
 
 /// Runs a storm against an agent on the robot, and checks the agent during the storm and after a
 /// silence.
-fn weather(link: &Link, silence: Duration, storm: impl FnOnce() -> Result<Storm>) -> Result<()> {
+fn start_storm(
+    link: &Link,
+    silence: Duration,
+    storm: impl FnOnce() -> Result<Storm>,
+) -> Result<()> {
     let directory = tempfile::tempdir()?;
     let file = directory.path().join("ros2probe.yaml");
     std::fs::write(&file, format!("watch: [/**]\nlog: warn\n{ON_THE_WIRE}"))?;
     let log = directory.path().join("log");
     let rp = Path::new(env!("CARGO_BIN_EXE_rp"));
     let agent = Agent::start_logging(&link.robot, rp, &file, &log)?;
-    let (ended, _pair) = a_real_topic_survives(&agent, link, storm)?;
+    let (ended, _pair) = check_real_topic(&agent, link, storm)?;
     std::thread::sleep(silence.saturating_sub(ended.elapsed()));
-    newcomers_are_counted(&agent, link)?;
+    check_new_participants(&agent, link)?;
     let log = std::fs::read_to_string(&log).context("the agent's log")?;
     assert!(log.lines().count() < 20, "{log}");
     Ok(())
@@ -314,7 +318,7 @@ fn matched_pair(link: &Link, stream: &Stream, nodes: [&str; 2]) -> Result<[Peer;
 
 /// Runs the storm beside a real topic: memory stays bounded, the page complete and the count exact.
 /// Returns when the storm ended, and the topic's endpoints.
-fn a_real_topic_survives(
+fn check_real_topic(
     agent: &Agent<'_>,
     link: &Link,
     storm: impl FnOnce() -> Result<Storm>,
@@ -326,7 +330,7 @@ fn a_real_topic_survives(
     };
     let [subscriber, mut publisher] = matched_pair(link, &stream, ["/listener", "/driver"])?;
 
-    publisher.go()?;
+    publisher.start_sending()?;
     let storm = storm()?;
     let began = Instant::now();
     let (mut largest, mut oldest) = (0, 0_f64);
@@ -370,7 +374,7 @@ fn a_real_topic_survives(
 }
 
 /// Checks that nodes that start after the storm are discovered, and their messages counted exactly.
-fn newcomers_are_counted(agent: &Agent<'_>, link: &Link) -> Result<()> {
+fn check_new_participants(agent: &Agent<'_>, link: &Link) -> Result<()> {
     let stream = Stream {
         topic: "/after".to_owned(),
         ..Stream::small(200)
@@ -392,7 +396,7 @@ fn newcomers_are_counted(agent: &Agent<'_>, link: &Link) -> Result<()> {
         std::thread::sleep(Duration::from_millis(200));
     }
     eprintln!("newcomers are seen after {:?}", came.elapsed());
-    publisher.go()?;
+    publisher.start_sending()?;
     publisher.wait_sent(Duration::from_secs(60))?;
     let page = agent.settled_scrape("/after", 200)?;
     let after = page.sum("ros2_topic_messages_total", &[("topic", "/after")]);
@@ -401,6 +405,6 @@ fn newcomers_are_counted(agent: &Agent<'_>, link: &Link) -> Result<()> {
 }
 
 fn well_formed(page: &Scrape) {
-    let said = local_agent::promtool(&page.0);
-    assert_eq!(said, "", "{}", page.0);
+    let printed = local_agent::promtool(&page.0);
+    assert_eq!(printed, "", "{}", page.0);
 }

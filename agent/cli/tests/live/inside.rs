@@ -10,7 +10,7 @@ use anyhow::{Context as _, Result, ensure};
 use ros2probe_api::chains::ChainList;
 use ros2probe_api::inside::Inside;
 use ros2probe_api::why::{LateCallback, Why};
-use ros2probe_capture::breakpoints::Means;
+use ros2probe_capture::breakpoints::AttachMethod;
 use ros2probe_capture::netns;
 use ros2probe_capture::system::Clocks;
 use ros2probe_testing::harness::agent::Agent;
@@ -38,7 +38,7 @@ const CLOSE: f64 = 0.000_2;
 
 #[test]
 fn the_times_of_a_chain_by_causality_are_those_of_its_processes() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let program = TracedProgram::build(248, &[])?;
     let agent = agent(&host, directory.path())?;
@@ -121,7 +121,7 @@ const LOADING: Duration = Duration::from_millis(150);
 
 #[test]
 fn a_library_of_another_inode_is_observed_from_the_first_call() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let agent = agent(&host, directory.path())?;
     let mut images = Vec::new();
@@ -166,7 +166,7 @@ const CREATION: &str = "ros_trace_rcl_publisher_init";
 
 #[test]
 fn calls_are_observed_while_a_client_requests_them_and_names_always() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let program = TracedProgram::build(248, &[])?;
     let agent = agent_with(&host, directory.path(), "auto", "")?;
@@ -250,8 +250,8 @@ fn calls_are_observed_while_a_client_requests_them_and_names_always() -> Result<
 }
 
 #[test]
-fn a_message_that_nobody_receives_is_late_in_its_socket() -> Result<()> {
-    let host = Namespace::alone()?;
+fn an_unreceived_message_is_late_in_its_socket() -> Result<()> {
+    let host = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let program = TracedProgram::build(248, &[])?;
     let _agent = agent_with(&host, directory.path(), "auto", "")?;
@@ -311,8 +311,8 @@ fn a_message_that_nobody_receives_is_late_in_its_socket() -> Result<()> {
 }
 
 #[test]
-fn a_call_that_sleeps_is_late_with_its_cause_from_the_first_question_on() -> Result<()> {
-    let host = Namespace::alone()?;
+fn a_sleeping_call_is_late_with_its_cause_from_the_first_request_on() -> Result<()> {
+    let host = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let program = TracedProgram::build(248, &[])?;
     let [enter, network] = host.outside();
@@ -449,9 +449,9 @@ fn agent_with<'n>(
 /// Returns the maximum number of attached libraries. With perf events, detaching 64 would take
 /// longer than the unit allows; 8 are still more than a robot has.
 fn libraries() -> usize {
-    match Means::of_this_kernel() {
-        Means::Links => 64,
-        Means::PerfEvents => 8,
+    match AttachMethod::of_this_kernel() {
+        AttachMethod::Links => 64,
+        AttachMethod::PerfEvents => 8,
     }
 }
 
@@ -473,7 +473,7 @@ fn an_agent_attached_to_many_libraries_ends_within_the_time_of_the_unit() -> Res
         seconds.parse().ok().map(Duration::from_secs)
     });
     let allowed = allowed.context("no TimeoutStopSec in seconds")?;
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let program = TracedProgram::build(248, &[])?;
     let mut arguments = vec!["-c".to_owned(), MAP.to_owned()];

@@ -109,7 +109,7 @@ impl Round {
             pair.subscriber.wait_matched()?;
         }
         for pair in &mut pairs {
-            pair.publisher.go()?;
+            pair.publisher.start_sending()?;
         }
         for pair in &mut pairs {
             pair.publisher.wait_sent()?;
@@ -235,8 +235,8 @@ impl Pair {
     }
 }
 
-/// Returns the options with which a subscriber of dust_dds matches Fast DDS, whose lease is infinite
-/// by default.
+/// Returns the options with which a subscriber of dust_dds matches Fast DDS, whose lease is
+/// infinite by default.
 fn lease_between(publisher: Library, subscriber: Library) -> &'static str {
     match (publisher, subscriber) {
         (Library::Fast, Library::Dust) => "--liveliness-lease 10000",
@@ -244,8 +244,8 @@ fn lease_between(publisher: Library, subscriber: Library) -> &'static str {
     }
 }
 
-/// Returns whether the libraries do not match though their QoS do: dust_dds takes the infinite lease
-/// of HDDS, which announces none, for a finite one.
+/// Returns whether the libraries do not match though their QoS do: dust_dds takes the infinite
+/// lease of HDDS, which announces none, for a finite one.
 fn is_mistaken(publisher: Library, subscriber: Library) -> bool {
     (publisher, subscriber) == (Library::Hdds, Library::Dust)
 }

@@ -20,11 +20,11 @@ const PATIENCE: Duration = Duration::from_secs(60);
 /// Time until a restarted agent has all names. Endpoints are announced only once.
 const AT_ONCE: Duration = Duration::from_secs(5);
 /// Time for two announcements of each participant.
-const AFTERWARDS: Duration = Duration::from_secs(7);
+const TWO_ANNOUNCEMENTS_TIME: Duration = Duration::from_secs(7);
 /// Seconds in which each participant announces itself at least once.
 const LISTEN: &str = "5";
 /// Makes Cyclone DDS announce itself every 3 s, as Fast DDS does, instead of every 8 s.
-const TALKATIVE: &str = "CYCLONEDDS_URI=<Discovery><SPDPInterval>3s</SPDPInterval></Discovery>";
+const FREQUENT_SPDP: &str = "CYCLONEDDS_URI=<Discovery><SPDPInterval>3s</SPDPInterval></Discovery>";
 const NODES: [&str; 3] = ["/camera", "/listener", "/talker"];
 
 #[test]
@@ -48,7 +48,7 @@ fn a_running_cyclone_dds_robot_repeats_all_names_on_request() -> Result<()> {
 }
 
 #[test]
-fn a_full_disk_costs_only_the_state_and_one_line_in_the_log() -> Result<()> {
+fn a_full_disk_loses_only_the_state_and_logs_one_line() -> Result<()> {
     let scene = Scene::new()?;
     let state = scene.file("state");
     let _disk = Disk::mount(&state)?;
@@ -160,16 +160,16 @@ fn asked(stack: Stack) -> Result<()> {
     std::thread::sleep(Duration::from_secs(1));
     let agent = scene.agent()?;
     let page = shows_an_unknown_writer(&agent, &robot)?;
-    a_dry_run_sends_nothing(&scene, &page)?;
+    check_dry_run(&scene, &page)?;
 
     let path = scene.file("asked.pcap");
     let recording = Capture::start(&scene.link.monitor, &path)?;
     let log_before = robot.log()?;
     let printed = discovers_all_names(&scene, &agent)?;
-    std::thread::sleep(AFTERWARDS);
+    std::thread::sleep(TWO_ANNOUNCEMENTS_TIME);
     std::thread::sleep(SETTLE);
-    packets_are_those_printed(&scene, &recording.finish()?, &printed)?;
-    the_robot_is_undisturbed(&robot, &log_before)?;
+    check_printed_packets(&scene, &recording.finish()?, &printed)?;
+    check_robot_counts(&robot, &log_before)?;
     let participants = |page: &Scrape| page.sum("ros2_participants", &[]) == 2.0;
     wait(&agent, participants, AT_ONCE, "the two that were there")?;
     Ok(())
@@ -180,8 +180,10 @@ fn shows_an_unknown_writer(agent: &Agent<'_>, robot: &Robot) -> Result<Scrape> {
     let unknown = |page: &Scrape| {
         let rate = page.value("ros2_unknown_writer_rate_hertz", &[]);
         let processes = page.labels_of("ros2_unknown_writer_info", "process");
-        let heard = page.sum("ros2_participants", &[]) == 2.0;
-        heard && rate.is_some_and(|rate| (80.0..120.0).contains(&rate)) && processes.len() == 1
+        let has_participants = page.sum("ros2_participants", &[]) == 2.0;
+        has_participants
+            && rate.is_some_and(|rate| (80.0..120.0).contains(&rate))
+            && processes.len() == 1
     };
     let page = wait(agent, unknown, PATIENCE, "an unknown writer with its rate")?;
     let values = |label| page.labels_of("ros2_unknown_writer_info", label);
@@ -201,26 +203,28 @@ fn shows_an_unknown_writer(agent: &Agent<'_>, robot: &Robot) -> Result<Scrape> {
 }
 
 /// Checks `rp discover --dry-run` for all participants and for one.
-fn a_dry_run_sends_nothing(scene: &Scene, page: &Scrape) -> Result<()> {
+fn check_dry_run(scene: &Scene, page: &Scrape) -> Result<()> {
     let recording = Capture::start(&scene.link.monitor, &scene.file("dry.pcap"))?;
     let output = scene.discover(&["--all", "--dry-run", "--interface", INTERFACE])?;
-    let said = String::from_utf8(output.stdout)?;
+    let output_text = String::from_utf8(output.stdout)?;
     assert!(
-        output.status.success() && said.starts_with("2 participants"),
-        "{said}"
+        output.status.success() && output_text.starts_with("2 participants"),
+        "{output_text}"
     );
     let guids = page.labels_of("ros2_participant_info", "participant");
     let one = guids.first().context("no participant")?;
     let output = scene.discover(&["--participant", one, "--dry-run", "--no-nodes"])?;
-    let said = String::from_utf8(output.stdout)?;
+    let output_text = String::from_utf8(output.stdout)?;
     assert!(
-        output.status.success() && said.starts_with("1 participant "),
-        "{said}"
+        output.status.success() && output_text.starts_with("1 participant "),
+        "{output_text}"
     );
     let plan = ["introduction", "request", "goodbye"];
-    let planned = said.lines().filter(|line| line.contains(", at most "));
+    let planned = output_text
+        .lines()
+        .filter(|line| line.contains(", at most "));
     let planned = planned.map(|line| line.trim().split(',').next().unwrap_or_default());
-    assert_eq!(planned.collect::<Vec<_>>(), plan, "{said}");
+    assert_eq!(planned.collect::<Vec<_>>(), plan, "{output_text}");
     std::thread::sleep(SETTLE);
     let sent = count(&recording.finish()?, &scene.packets_of_discover())?;
     assert_eq!(sent, 0, "a dry run sent");
@@ -230,25 +234,28 @@ fn a_dry_run_sends_nothing(scene: &Scene, page: &Scrape) -> Result<()> {
 /// Runs `rp discover --all`, and returns its output.
 fn discovers_all_names(scene: &Scene, agent: &Agent<'_>) -> Result<String> {
     let output = scene.discover(&["--all"])?;
-    let said = String::from_utf8(output.stdout)?;
-    println!("{said}");
-    assert!(output.status.success(), "{said}");
+    let output_text = String::from_utf8(output.stdout)?;
+    println!("{output_text}");
+    assert!(output.status.success(), "{output_text}");
     for node in NODES {
-        assert!(said.contains(&format!("node   {node}\n")), "{said}");
+        assert!(
+            output_text.contains(&format!("node   {node}\n")),
+            "{output_text}"
+        );
     }
     assert!(
-        said.contains("writer /imu sensor_msgs/msg/PointCloud2\n"),
-        "{said}"
+        output_text.contains("writer /imu sensor_msgs/msg/PointCloud2\n"),
+        "{output_text}"
     );
     let known = |page: &Scrape| nodes(page) == NODES.map(str::to_owned).into() && has_names(page);
     let page = wait(agent, known, AT_ONCE * 2, "all names after asking")?;
     assert_eq!(page.sum("ros2_unknown_writers", &[]), 0.0);
-    Ok(said)
+    Ok(output_text)
 }
 
 /// Checks that only the robot receives packets, as many as `rp discover` printed. Each conversation
 /// begins with the introduction and ends with the goodbye.
-fn packets_are_those_printed(scene: &Scene, recording: &Path, printed: &str) -> Result<()> {
+fn check_printed_packets(scene: &Scene, recording: &Path, printed: &str) -> Result<()> {
     let monitor = scene.link.monitor.address();
     let ours = scene.packets_of_discover();
     let sent = printed
@@ -289,7 +296,7 @@ fn packets_are_those_printed(scene: &Scene, recording: &Path, printed: &str) -> 
 }
 
 /// Checks that the robot's logs show no other endpoints and no missing sample.
-fn the_robot_is_undisturbed(robot: &Robot, log_before: &[EventLog; 2]) -> Result<()> {
+fn check_robot_counts(robot: &Robot, log_before: &[EventLog; 2]) -> Result<()> {
     let log_after = robot.log()?;
     assert_eq!(endpoints(log_before), endpoints(&log_after));
     let received = log_after[1].sequences("sub");
@@ -319,7 +326,7 @@ impl Scene {
         fs::create_dir(directory.path().join("state"))?;
         Ok(Scene {
             link: Link::new()?,
-            place: Namespace::alone()?,
+            place: Namespace::isolated()?,
             directory,
         })
     }
@@ -355,7 +362,7 @@ impl Scene {
             ..Stream::small(100_000)
         };
         let mut host = self.link.robot.inside();
-        host.extend(["env", TALKATIVE].map(str::to_owned));
+        host.extend(["env", FREQUENT_SPDP].map(str::to_owned));
         let start = |role, nodes: &[&str]| Peer::launch_behind(&host, stack, role, &stream, nodes);
         let mut subscriber = start(Role::Subscriber, &["/listener"])?;
         subscriber.wait_ready()?;
@@ -363,7 +370,7 @@ impl Scene {
         publisher.wait_ready()?;
         subscriber.wait_matched()?;
         publisher.wait_matched()?;
-        publisher.go()?;
+        publisher.start_sending()?;
         Ok(Robot {
             publisher,
             subscriber,

@@ -73,8 +73,8 @@ impl<'a> Place<'a> {
 }
 
 #[test]
-fn a_live_robot_is_learnt_without_a_watch_and_its_faults_are_found() -> Result<()> {
-    let host = Namespace::alone()?;
+fn expectations_of_a_live_robot_are_learnt_without_a_watch_and_detect_its_faults() -> Result<()> {
+    let host = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let place = Place::new(&host, directory.path())?;
     let imu = Stream {
@@ -94,7 +94,7 @@ fn a_live_robot_is_learnt_without_a_watch_and_its_faults_are_found() -> Result<(
     let mut lidar = start(Role::Publisher, &scan, "/lidar")?;
     for publisher in [&mut driver, &mut lidar] {
         publisher.wait_matched()?;
-        publisher.go()?;
+        publisher.start_sending()?;
     }
 
     let begin = Instant::now();
@@ -108,11 +108,11 @@ fn a_live_robot_is_learnt_without_a_watch_and_its_faults_are_found() -> Result<(
     ensure!(learning.try_wait()?.is_none(), "it ended by itself");
     harness::run(&format!("kill -INT {}", learning.id()))?;
     let output = learning.wait_with_output()?;
-    let said = String::from_utf8(output.stderr)?;
-    ensure!(output.status.success(), "{said}");
+    let printed = String::from_utf8(output.stderr)?;
+    ensure!(output.status.success(), "{printed}");
     ensure!(
-        said.lines().count() == 1 && said.contains("for 2 of 2 topics"),
-        "{said}"
+        printed.lines().count() == 1 && printed.contains("for 2 of 2 topics"),
+        "{printed}"
     );
     is_complete(&place.watchlist)?;
 
@@ -142,7 +142,7 @@ fn a_live_robot_is_learnt_without_a_watch_and_its_faults_are_found() -> Result<(
     };
     let mut driver = start(Role::Publisher, &half, "/driver")?;
     driver.wait_matched()?;
-    driver.go()?;
+    driver.start_sending()?;
     slam.process.terminate()?;
     for (topic, expectation) in [("/imu", "min_rate_hz"), ("/scan", "subscribers")] {
         let what = format!("{topic} violates {expectation}");
@@ -180,8 +180,8 @@ fn is_complete(watchlist: &Path) -> Result<()> {
 }
 
 #[test]
-fn an_agent_that_ends_during_rp_learn_leaves_no_watchlist() -> Result<()> {
-    let host = Namespace::alone()?;
+fn rp_learn_writes_no_watchlist_if_the_agent_ends() -> Result<()> {
+    let host = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let mut place = Place::new(&host, directory.path())?;
     let learning = place.learn()?;
@@ -191,10 +191,10 @@ fn an_agent_that_ends_during_rp_learn_leaves_no_watchlist() -> Result<()> {
     })?;
     place.agent.process.terminate()?;
     let output = learning.wait_with_output()?;
-    let said = String::from_utf8(output.stderr)?;
-    let last = said.lines().last().context("no error")?;
-    ensure!(output.status.code() == Some(1), "{said}");
-    ensure!(last.contains("the agent has ended"), "{said}");
+    let printed = String::from_utf8(output.stderr)?;
+    let last = printed.lines().last().context("no error")?;
+    ensure!(output.status.code() == Some(1), "{printed}");
+    ensure!(last.contains("the agent has ended"), "{printed}");
     ensure!(!place.watchlist.exists());
     Ok(())
 }

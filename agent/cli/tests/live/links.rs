@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::Result;
 use ros2probe_testing::forged::frames::{Shuffle, Tun, Wire};
-use ros2probe_testing::forged::{Carrier, Sender, Talker, introduce, talk};
+use ros2probe_testing::forged::{Carrier, Sender, Talker, introduce, send_sizes};
 use ros2probe_testing::harness::agent::{Agent, Scrape};
 use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
@@ -63,7 +63,7 @@ fn cyclone_dds_over_ipv6_is_counted_as_over_ipv4() -> Result<()> {
     let mut publisher = start(&link.robot, Role::Publisher, "/lidar_driver")?;
     publisher.wait_matched()?;
     subscriber.wait_matched()?;
-    publisher.go()?;
+    publisher.start_sending()?;
     publisher.wait_sent(Duration::from_secs(60))?;
     let nodes = observed
         .agent
@@ -113,7 +113,7 @@ fn a_sample_that_passes_two_interfaces_of_one_host_counts_once() -> Result<()> {
 
 #[test]
 fn loopback_traffic_counts_once() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let observed = Observed::start(&host, WATCH_ALL)?;
     let mut sender = Sender::new(&host, "127.0.0.1:0", "127.0.0.1:7400")?;
     observed.counts_each_sample_once("/v4", &mut sender)?;
@@ -123,7 +123,7 @@ fn loopback_traffic_counts_once() -> Result<()> {
 
 #[test]
 fn a_tunnel_without_a_link_layer_is_seen() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let observed = Observed::start(&host, WATCH_ALL)?;
     let mut tun = Tun::new(&host, "tun0", [10, 88, 0, 2], [10, 88, 0, 1])?;
     ip(&host, "addr add 10.88.0.1/24 dev tun0")?;
@@ -178,7 +178,7 @@ fn an_excluded_interface_is_not_seen_even_if_it_appears_later() -> Result<()> {
             let mut sender = Sender::new(&link.robot, &from, &to)?;
             let mut talker = Talker::new(third, "/private");
             introduce(&talker, &mut sender)?;
-            talk(&mut talker, &mut sender, [320; 20])?;
+            send_sizes(&mut talker, &mut sender, [320; 20])?;
         }
         let (from, to) = (
             format!("10.{}.0.1:0", 120 + round),
@@ -223,7 +223,7 @@ fn a_renamed_interface_is_selected_by_its_new_name() -> Result<()> {
     rename("eth7", "wlan7")?;
     let mut talker = Talker::new(1, "/unwanted");
     introduce(&talker, &mut sender)?;
-    talk(&mut talker, &mut sender, [320; 20])?;
+    send_sizes(&mut talker, &mut sender, [320; 20])?;
     let scrape = observed.agent.settled_scrape("/wanted", 0)?;
     assert!(!scrape.0.contains("/unwanted"), "{}", scrape.0);
     assert_eq!(scrape.sum("ros2_unknown_writers", &[]), 0.0);
@@ -349,10 +349,10 @@ fn a_sample_with_a_missing_fragment_never_counts() -> Result<()> {
             1 => |packets| drop(packets.pop()),
             _ => |packets| drop(packets.remove(packets.len() / 2)),
         };
-        talk(&mut talker, &mut wire, [6000])?;
+        send_sizes(&mut talker, &mut wire, [6000])?;
     }
     wire.shuffle = whole;
-    talk(&mut talker, &mut wire, [6000])?;
+    send_sizes(&mut talker, &mut wire, [6000])?;
     let scrape = observed.agent.settled_scrape("/torn", 11)?;
     assert!(scrape.sum("ros2probe_records_dropped_total", &[]) == 0.0);
     let value = |name| value(&scrape, name, "/torn");
@@ -412,7 +412,7 @@ impl<'a> Observed<'a> {
             .cycle()
             .take(SIZES.len() * ROUNDS)
             .collect();
-        talk(&mut talker, carrier, sizes.iter().copied())?;
+        send_sizes(&mut talker, carrier, sizes.iter().copied())?;
         let count = sizes.len() as u64;
         let scrape = self.agent.settled_scrape(topic, count)?;
         assert_exact(&scrape, topic, count, sizes.iter().sum::<usize>() as u64);

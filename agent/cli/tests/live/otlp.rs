@@ -60,7 +60,7 @@ fn field(item: &Item, name: &str) -> Result<String> {
 }
 
 #[test]
-fn two_hosts_report_the_same_traces_and_a_stopped_receiver_costs_no_capture() -> Result<()> {
+fn two_hosts_report_the_same_traces_and_a_stopped_receiver_loses_no_capture() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let mut at_robot = Rotel::start(&mut on(&link.robot), directory.path(), None);
@@ -97,13 +97,13 @@ fn two_hosts_report_the_same_traces_and_a_stopped_receiver_costs_no_capture() ->
     // The receiver is stopped while the stream begins.
     let address = at_robot.address;
     drop(at_robot);
-    publisher.go()?;
+    publisher.start_sending()?;
     agent.scrape_until("given up metrics", |page| {
         page.sum(DROPPED, &[("signal", "metrics")]) > 0.0
     })?;
     let mut at_robot = Rotel::start(&mut on(&link.robot), directory.path(), Some(address));
     publisher.wait_sent(Duration::from_secs(60))?;
-    nothing_was_lost(&agent.settled_scrape("/truth", MESSAGES)?)?;
+    check_no_loss(&agent.settled_scrape("/truth", MESSAGES)?)?;
 
     let writer = publisher
         .log()?
@@ -146,7 +146,7 @@ fn spans_of_all_kinds_come(at_robot: &mut Rotel, at_monitor: &mut Rotel) -> Resu
 }
 
 /// Checks that every message is counted and no span is dropped while the receiver is stopped.
-fn nothing_was_lost(page: &Scrape) -> Result<()> {
+fn check_no_loss(page: &Scrape) -> Result<()> {
     let truth = [("topic", "/truth")];
     let counted = page.sum("ros2_topic_messages_total", &truth);
     ensure!(counted as u64 == MESSAGES, "{counted} counted");

@@ -40,7 +40,7 @@ fn lines(host: &Namespace, path: &str, seconds: u32) -> Result<Vec<Value>> {
 
 #[test]
 fn the_stream_shows_a_running_robot() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let configuration = directory.path().join("ros2probe.yaml");
     let text = format!("{}watch: [/**]\n", at_the_sockets_of(&host));
@@ -276,8 +276,8 @@ fn every_command_of_the_readme_works_against_the_demo() -> Result<()> {
             .args(options.split_whitespace())
             .output()?;
         let text = String::from_utf8_lossy(&output.stdout).into_owned();
-        let said = String::from_utf8_lossy(&output.stderr);
-        ensure!(output.status.success(), "rp {words:?}: {said}");
+        let output_text = String::from_utf8_lossy(&output.stderr);
+        ensure!(output.status.success(), "rp {words:?}: {output_text}");
         ensure!(text.contains(expected), "rp {words:?}: {text}");
     }
     Ok(())

@@ -84,7 +84,7 @@ impl Exchange {
         subscriber.wait_matched()?;
         publisher.wait_matched()?;
         let loss = Loss::of_samples(&link.robot, &link.monitor, &stream, per_mille)?;
-        publisher.go()?;
+        publisher.start_sending()?;
         publisher.wait_sent(Duration::from_secs(60))?;
         std::thread::sleep(Duration::from_millis(300));
         let counts = loss.counts()?;

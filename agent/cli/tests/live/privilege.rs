@@ -27,7 +27,7 @@ use seccompiler::{BpfProgram, SeccompAction, SeccompFilter};
 
 const SAMPLES: u64 = 400;
 /// The empty capability set and `CAP_BPF` alone, as /proc shows them.
-const NOTHING: &str = "0000000000000000";
+const NO_CAPABILITIES: &str = "0000000000000000";
 const BPF_ALONE: &str = "0000008000000000";
 /// `CAP_NET_ADMIN` alone, and with `CAP_BPF`.
 const NET_ADMIN_ALONE: &str = "0000000000001000";
@@ -151,7 +151,7 @@ fn installed(host: &Namespace, file: &impl Fn(&str) -> PathBuf) -> Result<()> {
 
 #[test]
 fn an_agent_started_by_root_changes_its_user_and_writes_no_file_of_root() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let file = |name: &str| -> PathBuf { directory.path().join(name) };
     let socket = file("run").join("api.sock");
@@ -164,8 +164,8 @@ fn an_agent_started_by_root_changes_its_user_and_writes_no_file_of_root() -> Res
     for line in [
         format!("Uid:\t{USER}\t{USER}\t{USER}\t{USER}"),
         format!("Gid:\t{USER}\t{USER}\t{USER}\t{USER}"),
-        format!("CapPrm:\t{NOTHING}"),
-        format!("CapBnd:\t{NOTHING}"),
+        format!("CapPrm:\t{NO_CAPABILITIES}"),
+        format!("CapBnd:\t{NO_CAPABILITIES}"),
         "Seccomp:\t2".to_owned(),
     ] {
         ensure!(main.lines().any(|other| other == line), "{line} in\n{main}");
@@ -226,20 +226,20 @@ fn an_agent_that_cannot_drop_its_capabilities_serves_nothing() -> Result<()> {
         command.pre_exec(move || seccompiler::apply_filter(&lie).map_err(io::Error::other));
     }
     let output = command.output()?;
-    let said = String::from_utf8_lossy(&output.stderr);
+    let printed = String::from_utf8_lossy(&output.stderr);
     ensure!(
         output.status.code() == Some(77),
-        "{:?}: {said}",
+        "{:?}: {printed}",
         output.status
     );
-    ensure!(said.contains("refusing to serve: CAP_"), "{said}");
-    ensure!(!said.contains("serving"), "{said}");
+    ensure!(printed.contains("refusing to serve: CAP_"), "{printed}");
+    ensure!(!printed.contains("serving"), "{printed}");
     Ok(())
 }
 
 #[test]
 fn an_agent_resolves_the_name_of_a_collector_and_connects_to_it() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let network = host.network();
     let (names, collector) = netns::within(&network, || -> Result<_> {
         let names = UdpSocket::bind("127.0.0.1:53")?;
@@ -379,10 +379,10 @@ fn confined(process: u32, user: u32) -> Result<BTreeSet<String>> {
             let may_keep = matches!(set, "CapPrm" | "CapEff");
             let kept: &[&str] = match name {
                 // Before Linux 5.19, changing maps needs this capability.
-                "capture" if may_keep => &[NOTHING, BPF_ALONE],
+                "capture" if may_keep => &[NO_CAPABILITIES, BPF_ALONE],
                 // The thread attaches to a control group that is created again.
                 "cgroup" if may_keep => &[NET_ADMIN_ALONE, NET_ADMIN_AND_BPF],
-                _ => &[NOTHING],
+                _ => &[NO_CAPABILITIES],
             };
             ensure!(kept.contains(&left), "{status}");
         }
@@ -413,7 +413,7 @@ fn watch_a_stream(link: &Link, agent: &Agent<'_>) -> Result<Scrape> {
     )?;
     subscriber.wait_matched()?;
     publisher.wait_matched()?;
-    publisher.go()?;
+    publisher.start_sending()?;
     publisher.wait_sent(Duration::from_secs(30))?;
     let page = agent.settled_scrape("/imu", SAMPLES)?;
     let received = page.sum(

@@ -57,7 +57,7 @@ fn prometheus_returns_the_rates_at_which_the_demo_robot_publishes() -> Result<()
     subscriber.wait_matched()?;
     publisher.wait_matched()?;
     ensure!(prometheus.query("up")? > 0.5, "the scrape works");
-    publisher.go()?;
+    publisher.start_sending()?;
     let publisher_log = publisher.log_path();
     let sent = || -> Result<Vec<u64>> {
         let log = EventLog::read(&publisher_log)?;
@@ -111,11 +111,11 @@ fn promtool(page: &str) -> Result<()> {
         .context("no input")?
         .write_all(page.as_bytes())?;
     let output = child.wait_with_output()?;
-    let said = [output.stdout, output.stderr].concat();
+    let printed = [output.stdout, output.stderr].concat();
     ensure!(
-        output.status.success() && said.is_empty(),
+        output.status.success() && printed.is_empty(),
         "promtool: {}",
-        String::from_utf8_lossy(&said)
+        String::from_utf8_lossy(&printed)
     );
     Ok(())
 }

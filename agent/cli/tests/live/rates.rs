@@ -29,7 +29,7 @@ static TURN: Mutex<()> = Mutex::new(());
 #[test]
 fn ten_clients_print_correct_rates_on_a_busy_machine_and_leave_no_trace() -> Result<()> {
     let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let (agent, socket) = agent(&host, directory.path())?;
     let stream = Stream::small(100_000);
@@ -56,7 +56,7 @@ fn ten_clients_print_correct_rates_on_a_busy_machine_and_leave_no_trace() -> Res
     let bandwidth = start("bw /imu")?;
     let delay = start("delay /imu")?;
     open(&agent, 10)?;
-    publisher.go()?;
+    publisher.start_sending()?;
 
     killed.prints("=====")?;
     killed.child.kill()?;
@@ -82,13 +82,13 @@ fn ten_clients_print_correct_rates_on_a_busy_machine_and_leave_no_trace() -> Res
         Ok((60.0..=70.0).contains(&bandwidth.last("")))
     })
     .with_context(|| bandwidth.printed().join("\n"))?;
-    let said = delay.last("average delay: ");
-    ensure!((0.0..0.1).contains(&said), "{said} s");
+    let output_text = delay.last("average delay: ");
+    ensure!((0.0..0.1).contains(&output_text), "{output_text} s");
 
     for client in [hz, all, bandwidth, delay] {
         drop(client);
     }
-    let_go(&agent, "/imu", 1000.0)?;
+    check_unsubscribed(&agent, "/imu", 1000.0)?;
     ensure!(publisher.log()?.sequences("pub").len() as f64 > sent as f64 + RATE);
     Ok(())
 }
@@ -106,15 +106,15 @@ fn is_the_rate_sent(hz: &Client, publisher: &Peer, subscriber: &Peer) -> Result<
         sent.last().context("nothing")?,
     );
     let true_rate = (sent.len() - 1) as f64 / ((last - first) as f64 / 1e9);
-    let said = hz.last("average rate: ");
+    let output_text = hz.last("average rate: ");
     let heard = subscriber.log()?.sequences("sub").len();
     eprintln!(
-        "said {said}, sent {true_rate:.3} Hz; of {} sent {heard} were received",
+        "said {output_text}, sent {true_rate:.3} Hz; of {} sent {heard} were received",
         sent.len()
     );
     ensure!(
-        (said - true_rate).abs() <= true_rate / 1000.0,
-        "{said} of {true_rate}"
+        (output_text - true_rate).abs() <= true_rate / 1000.0,
+        "{output_text} of {true_rate}"
     );
     Ok(sent.len())
 }
@@ -142,7 +142,7 @@ fn echoing_point_clouds_takes_bounded_memory_and_changes_no_count() -> Result<()
     const AGENT: u64 = 160 << 20;
     const CLIENT: u64 = 64 << 20;
     let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let (agent, socket) = agent(&host, directory.path())?;
     let stream = Stream {
@@ -157,7 +157,7 @@ fn echoing_point_clouds_takes_bounded_memory_and_changes_no_count() -> Result<()
     })?;
     let hz = Client::start(&socket, "hz /points")?;
     let mut echo = Client::start(&socket, "echo /points")?;
-    publisher.go()?;
+    publisher.start_sending()?;
     let shown = || -> usize {
         let printed = echo.printed();
         printed
@@ -198,18 +198,18 @@ fn echoing_point_clouds_takes_bounded_memory_and_changes_no_count() -> Result<()
     let (first, last) = (sent.first(), sent.last());
     let (first, last) = (first.context("nothing sent")?, last.context("nothing")?);
     let true_rate = (sent.len() - 1) as f64 / ((last - first) as f64 / 1e9);
-    let said = hz.last("average rate: ");
+    let output_text = hz.last("average rate: ");
     ensure!(
-        (said - true_rate).abs() <= true_rate / 20.0,
-        "{said} of {true_rate}"
+        (output_text - true_rate).abs() <= true_rate / 20.0,
+        "{output_text} of {true_rate}"
     );
     drop(hz);
-    let_go(&agent, "/points", 50.0)
+    check_unsubscribed(&agent, "/points", 50.0)
 }
 
 /// Checks that the topic continues and its count stays: a subscription that a client left behind
 /// would increase it.
-fn let_go(agent: &Agent<'_>, topic: &str, least: f64) -> Result<()> {
+fn check_unsubscribed(agent: &Agent<'_>, topic: &str, least: f64) -> Result<()> {
     wait_until("the topic is let go", || {
         let counted = || -> Result<f64> {
             let labels = [("topic", topic)];
@@ -239,19 +239,19 @@ fn piped_into_head(socket: &Path) -> Result<()> {
         socket.display()
     );
     let output = Command::new("bash").args(["-c", &script]).output()?;
-    let (said, errors) = (
+    let (output_text, errors) = (
         String::from_utf8_lossy(&output.stdout),
         String::from_utf8_lossy(&output.stderr),
     );
-    let lines: Vec<&str> = said.lines().collect();
+    let lines: Vec<&str> = output_text.lines().collect();
     let [rate, spread, code] = lines[..] else {
-        anyhow::bail!("{said}{errors}");
+        anyhow::bail!("{output_text}{errors}");
     };
     ensure!(
         rate.starts_with("average rate: ") && spread.starts_with("\tmin: "),
-        "{said}"
+        "{output_text}"
     );
-    ensure!(code == "141" && errors.is_empty(), "{said}{errors}");
+    ensure!(code == "141" && errors.is_empty(), "{output_text}{errors}");
     Ok(())
 }
 

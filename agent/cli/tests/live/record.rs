@@ -40,7 +40,7 @@ static MACHINE: RwLock<()> = RwLock::new(());
 #[test]
 fn every_message_is_in_the_bags_or_counted_as_missing() -> Result<()> {
     let _alone = MACHINE.write().unwrap_or_else(PoisonError::into_inner);
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let robot = Robot::start(&host, "watch: ['/**']\n", &host.on_network())?;
     let streams = [
         (Stack::Cyclone, "/front", CLOUD, CLOUDS),
@@ -59,7 +59,7 @@ fn every_message_is_in_the_bags_or_counted_as_missing() -> Result<()> {
     ensure!(status == 201, "{status}");
     let mut client = Recorder::start(&robot, "client", &["-a"])?;
     for (_, _, publisher, _) in &mut pairs {
-        publisher.go()?;
+        publisher.start_sending()?;
     }
     let page = settled(&robot, &pairs, 1)?;
     let (status, ended) = robot.ask("DELETE", "/recordings/all", &Value::Null)?;
@@ -73,7 +73,7 @@ fn every_message_is_in_the_bags_or_counted_as_missing() -> Result<()> {
         (robot.bags().join("all"), ended["report"].clone()),
         (by_client.clone(), report_of(&by_client)?),
     ] {
-        all_or_counted(&bag, &report, &pairs, &page)?;
+        check_all_or_counted(&bag, &report, &pairs, &page)?;
     }
     if is_exact(&page) {
         for (topic, count, ..) in &pairs {
@@ -85,7 +85,7 @@ fn every_message_is_in_the_bags_or_counted_as_missing() -> Result<()> {
             ensure!(
                 (messages, lost) == (*count as f64, 0.0),
                 "{topic}: {messages} counted, {lost} lost: {}",
-                page.doubts()
+                page.doubted_jumps()
             );
         }
     }
@@ -127,7 +127,7 @@ fn start_pairs(
 
 /// Checks that each message of the first stretch is in the bag, or counted as missing in the
 /// report.
-fn all_or_counted(bag: &Path, report: &Value, pairs: &[Pair], page: &Scrape) -> Result<()> {
+fn check_all_or_counted(bag: &Path, report: &Value, pairs: &[Pair], page: &Scrape) -> Result<()> {
     let numbers = numbers(bag)?;
     let mut messages = 0;
     for (topic, count, publisher, _) in pairs {
@@ -145,7 +145,11 @@ fn all_or_counted(bag: &Path, report: &Value, pairs: &[Pair], page: &Scrape) -> 
         ensure!(recorded.is_subset(&sent), "{topic}");
         if is_exact(page) {
             let all = recorded.len() as u64 + missing;
-            ensure!(all == *count, "{topic}: {report:#}\n{}", page.doubts());
+            ensure!(
+                all == *count,
+                "{topic}: {report:#}\n{}",
+                page.doubted_jumps()
+            );
         }
         ensure!(recorded.len() as u64 * 2 > *count, "{topic}: {report:#}");
     }
@@ -164,7 +168,7 @@ fn a_slow_reader_loses_the_largest(robot: &Robot<'_>, pairs: &mut [Pair]) -> Res
     let mut slow = Recorder::start(robot, "slow", &arguments)?;
     slow.process.signal("STOP")?;
     for (_, _, publisher, _) in pairs.iter_mut() {
-        publisher.go()?;
+        publisher.start_sending()?;
     }
     let page = settled(robot, pairs, 2)?;
     let memory = Usage::of(robot.agent.process.pid())?.memory.unreclaimable;
@@ -196,7 +200,11 @@ fn a_slow_reader_loses_the_largest(robot: &Robot<'_>, pairs: &mut [Pair]) -> Res
         ensure!(recorded.is_subset(&sent), "{topic}");
         if is_exact(&page) {
             let all = recorded.len() as u64 + missing;
-            ensure!(all == *count, "{topic}: {report:#}\n{}", page.doubts());
+            ensure!(
+                all == *count,
+                "{topic}: {report:#}\n{}",
+                page.doubted_jumps()
+            );
         }
         // The largest messages are dropped first, so small messages stay complete.
         let is_large = *topic == "/front";
@@ -215,12 +223,12 @@ fn a_slow_reader_loses_the_largest(robot: &Robot<'_>, pairs: &mut [Pair]) -> Res
 #[test]
 fn a_recording_is_controlled_by_its_client_and_outlives_it() -> Result<()> {
     let _shared = MACHINE.read().unwrap_or_else(PoisonError::into_inner);
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let settings = "watch: [{topic: /imu, max_silence_s: 4}]\n\
                     recordings: {snapshots: [{name: incident, topics: [/imu], seconds: 10}]}\n";
     let mut robot = Robot::start(&host, settings, &host.on_network())?;
     let (mut imu, _subscriber) = robot.pair(&Stream::small(1_000_000))?;
-    imu.go()?;
+    imu.start_sending()?;
 
     names_that_lead_elsewhere_are_refused(&robot)?;
     a_client_pauses_resumes_splits_and_ends_a_recording(&robot)?;
@@ -355,7 +363,7 @@ fn numbers_of_imu(bag: &Path) -> Result<BTreeSet<u64>> {
 #[test]
 fn a_full_storage_ends_a_recording_in_order() -> Result<()> {
     let _shared = MACHINE.read().unwrap_or_else(PoisonError::into_inner);
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     // Only the agent has this disk of 4 MB.
     let mut enter = host.on_network();
     let script = r#"mount -t tmpfs -o size=4m none "$0" && exec "$@""#;
@@ -363,7 +371,7 @@ fn a_full_storage_ends_a_recording_in_order() -> Result<()> {
     let robot = Robot::start_on_disk(&host, "watch: []\n", enter)?;
     let stream = Stream::point_cloud(SCAN, 1_000_000);
     let (mut lidar, _subscriber) = robot.pair(&stream)?;
-    lidar.go()?;
+    lidar.start_sending()?;
 
     let (status, begun) = robot.ask("POST", "/recordings", &json!({"name": "full"}))?;
     ensure!(status == 201, "{begun}");

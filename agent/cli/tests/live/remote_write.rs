@@ -34,8 +34,8 @@ fn victoria_metrics_gets_the_samples_of_an_outage_in_which_the_agent_was_killed(
 }
 
 #[test]
-fn rp_fleet_finds_the_odd_ones_of_ten_robots() -> Result<()> {
-    let centre = Namespace::alone()?;
+fn rp_fleet_finds_the_differing_robots_among_ten() -> Result<()> {
+    let centre = Namespace::isolated()?;
     let prometheus = Prometheus::run(&centre, Kind::Server, "global: {scrape_interval: 1s}\n")?;
     let directory = tempfile::tempdir()?;
     let mut robots = BTreeMap::new();

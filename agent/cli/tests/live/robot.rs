@@ -32,7 +32,7 @@ fn logs(link: &Link, query: &str) -> Result<Logs<'static>> {
 }
 
 #[test]
-fn logs_are_counted_kept_printed_and_judged_without_a_watch() -> Result<()> {
+fn logs_are_counted_kept_printed_and_diagnosed_without_a_watch() -> Result<()> {
     let link = Link::new()?;
     let config = tempfile::tempdir()?;
     let file = config.path().join("ros2probe.yaml");
@@ -122,7 +122,7 @@ fn logs_are_counted_kept_printed_and_judged_without_a_watch() -> Result<()> {
 }
 
 #[test]
-fn logs_are_not_read_if_the_configuration_says_so() -> Result<()> {
+fn logs_are_not_read_if_the_configuration_disables_them() -> Result<()> {
     let link = Link::new()?;
     let config = tempfile::tempdir()?;
     let file = config.path().join("ros2probe.yaml");

@@ -1,5 +1,5 @@
-//! What the robot itself says: diagnostics, parameters and transforms in metrics, API, findings and commands,
-//! without a watch. Needs root.
+//! What the robot itself says: diagnostics, parameters and transforms in metrics, API, findings and
+//! commands, without a watch. Needs root.
 
 use std::process::{Command, Stdio};
 use std::time::Duration;
@@ -28,9 +28,9 @@ impl Node {
     pub(crate) fn start(link: &Link, number: u32, name: &str, topic: (&str, &str)) -> Result<Self> {
         let talker = Talker::new(number, "/unused");
         let mut sender = Sender::between(&link.robot, &link.monitor)?;
-        sender.carry(&talker.participant())?;
-        sender.carry(&talker.publication(SAMPLES_WRITER, topic.0, topic.1, 1))?;
-        sender.carry(&talker.entities(name))?;
+        sender.send(&talker.participant())?;
+        sender.send(&talker.publication(SAMPLES_WRITER, topic.0, topic.1, 1))?;
+        sender.send(&talker.entities(name))?;
         Ok(Self {
             talker,
             sender,
@@ -40,13 +40,13 @@ impl Node {
 
     /// Announces the node's participant again, whose lease would end.
     pub(crate) fn renew(&mut self) -> Result<()> {
-        self.sender.carry(&self.talker.participant())
+        self.sender.send(&self.talker.participant())
     }
 
     pub(crate) fn send(&mut self, payload: &[u8]) -> Result<()> {
         self.number += 1;
         let message = (self.talker).message(SAMPLES_WRITER, self.number, payload);
-        self.sender.carry(&message)
+        self.sender.send(&message)
     }
 
     fn say(&mut self, level: u8, message: &str) -> Result<()> {
@@ -335,9 +335,9 @@ fn a_name_with_a_mistake_and_a_frame_without_a_transform_are_found() -> Result<(
     let mut ekf = Node::start(&link, 2, "ekf", ("rt/tf", robot_transforms::DDS_TYPE))?;
     let viewer = Talker::new(3, "/unused");
     let mut sender = Sender::between(&link.robot, &link.monitor)?;
-    sender.carry(&viewer.participant())?;
-    sender.carry(&viewer.subscription([0, 0, 3, 4], "rt/camera/imgae", image, 1))?;
-    sender.carry(&viewer.entities("viewer"))?;
+    sender.send(&viewer.participant())?;
+    sender.send(&viewer.subscription([0, 0, 3, 4], "rt/camera/imgae", image, 1))?;
+    sender.send(&viewer.entities("viewer"))?;
     agent.scrape_until("the nodes", |page| page.sum("ros2_nodes", &[]) == 3.0)?;
     // Messages renew the leases, which are short.
     for step in 0..26 {
@@ -349,7 +349,7 @@ fn a_name_with_a_mistake_and_a_frame_without_a_transform_are_found() -> Result<(
             x: 0.0,
             yaw: 0.0,
         }]))?;
-        sender.carry(&viewer.participant())?;
+        sender.send(&viewer.participant())?;
         std::thread::sleep(Duration::from_millis(500));
     }
     agent.scrape_until("the near miss", |page| {

@@ -8,7 +8,7 @@ use crate::browser::PAGE;
 use crate::browser::player::watch;
 use anyhow::{Context as _, Result, bail, ensure};
 use ros2probe_capture::netns;
-use ros2probe_testing::forged::{Carrier, Talker, framed, introduce, talk};
+use ros2probe_testing::forged::{Carrier, Talker, framed, introduce, send_sizes};
 use ros2probe_testing::harness::agent::{Agent, Scrape, at_the_sockets_of};
 use ros2probe_testing::harness::loss::Loss;
 use ros2probe_testing::harness::network::{INTERFACE, Link, Namespace};
@@ -59,7 +59,8 @@ fn streams(address: Ipv4Addr) -> [Stream; 3] {
 }
 
 /// Starts a publisher, then a subscriber that connects to it, and waits until they are matched.
-/// Rarely, Fast DDS 2.9 exchanges the first control messages and nothing more: then both start again.
+/// Rarely, Fast DDS 2.9 exchanges the first control messages and nothing more: then both start
+/// again.
 fn pair(from: &Namespace, to: &Namespace, stream: &Stream) -> Result<(Peer, Peer)> {
     for _ in 0..ATTEMPTS {
         let mut publisher = Peer::start(from, Stack::Fast, Role::Publisher, stream, &["/sensor"])?;
@@ -93,7 +94,7 @@ fn knows(page: &Scrape, topic: &str) -> bool {
         && page.value("ros2_topic_publishers", &[("topic", topic)]) == Some(1.0)
 }
 
-fn nothing_was_dropped(page: &Scrape) -> Result<()> {
+fn check_no_drops(page: &Scrape) -> Result<()> {
     let lost = [("event", "rtps_tcp_chunks_lost")];
     let lost = page.sum("ros2probe_filter_events_total", &lost);
     ensure!(lost == 0.0, "{lost} chunks");
@@ -106,14 +107,14 @@ fn nothing_was_dropped(page: &Scrape) -> Result<()> {
 #[test]
 fn counts_and_deliveries_on_one_host_equal_the_logs() -> Result<()> {
     for stream in streams(Ipv4Addr::LOCALHOST) {
-        let host = Namespace::alone()?;
+        let host = Namespace::isolated()?;
         let observer = Observer::start(&host, &at_the_sockets_of(&host))?;
         let (mut publisher, mut subscriber) = pair(&host, &host, &stream)?;
         let agent = &observer.agent;
         let page = agent.scrape_until("both endpoints", |page| knows(page, &stream.topic))?;
         let by_tcp = [("topic", stream.topic.as_str()), ("passage", "tcp")];
         assert_eq!(page.value("ros2_topic_pairs", &by_tcp), Some(1.0));
-        publisher.go()?;
+        publisher.start_sending()?;
         publisher.wait_sent(PATIENCE)?;
         let page = agent.settled_scrape(&stream.topic, stream.count)?;
         subscriber.process.terminate()?;
@@ -124,7 +125,7 @@ fn counts_and_deliveries_on_one_host_equal_the_logs() -> Result<()> {
         let counted = counted.map(|what| count(&page, what, topic));
         assert_eq!(counted, [sent, received, 0], "{} B", stream.size);
         assert_eq!(count(&page, "bytes", topic), sent * stream.size as u64);
-        nothing_was_dropped(&page)?;
+        check_no_drops(&page)?;
     }
     Ok(())
 }
@@ -140,7 +141,7 @@ fn counts_on_two_hosts_equal_the_logs_at_either_end() -> Result<()> {
             let agent = &observer.agent;
             agent.scrape_until("both endpoints", |page| knows(page, &stream.topic))?;
         }
-        publisher.go()?;
+        publisher.start_sending()?;
         publisher.wait_sent(PATIENCE)?;
         let pages = [&robot, &monitor].map(|observer| {
             let agent = &observer.agent;
@@ -153,7 +154,7 @@ fn counts_on_two_hosts_equal_the_logs_at_either_end() -> Result<()> {
             let page = page?;
             let counted = ["messages", "delivered_messages", "lost_messages"];
             let counted = counted.map(|what| count(&page, what, &stream.topic));
-            nothing_was_dropped(&page)?;
+            check_no_drops(&page)?;
             let expected = [sent, delivered, 0];
             assert_eq!(counted, expected, "{} B: {}", stream.size, page.0);
         }
@@ -162,7 +163,7 @@ fn counts_on_two_hosts_equal_the_logs_at_either_end() -> Result<()> {
 }
 
 #[test]
-fn segments_that_tcp_sends_again_cost_no_message() -> Result<()> {
+fn segments_retransmitted_by_tcp_lose_no_message() -> Result<()> {
     let mut all_dropped = 0;
     // Packets of up to 64 KB, and packets of one segment.
     for most_segments in [64, 1] {
@@ -185,7 +186,7 @@ fn segments_that_tcp_sends_again_cost_no_message() -> Result<()> {
             agent.scrape_until("both endpoints", |page| knows(page, &stream.topic))?;
             let packets = format!("ip daddr {} tcp sport {PORT}", link.monitor.address());
             let loss = Loss::of(&link.robot, &packets, 30)?;
-            publisher.go()?;
+            publisher.start_sending()?;
             publisher.wait_sent(PATIENCE)?;
             let page = agent.settled_scrape(&stream.topic, stream.count)?;
             all_dropped += loss.counts()?.dropped;
@@ -225,7 +226,7 @@ fn samples_that_the_sender_drops_are_lost_at_the_sender() -> Result<()> {
     run(&format!(
         "{outside} tc qdisc add dev {INTERFACE} root tbf {SLOW}"
     ))?;
-    publisher.go()?;
+    publisher.start_sending()?;
     publisher.wait_sent(PATIENCE)?;
     let page = agent.settled_scrape(&stream.topic, 1)?;
     let log = subscriber.log()?;
@@ -237,7 +238,7 @@ fn samples_that_the_sender_drops_are_lost_at_the_sender() -> Result<()> {
     };
     assert_eq!(count(&page, "delivered_messages", &stream.topic), received);
     assert_eq!((lost("sender"), lost("before_host")), (missing as f64, 0.0));
-    nothing_was_dropped(&page)?;
+    check_no_drops(&page)?;
     watch(
         &link.monitor.outside(),
         "sender",
@@ -246,7 +247,7 @@ fn samples_that_the_sender_drops_are_lost_at_the_sender() -> Result<()> {
 }
 
 #[test]
-fn segments_that_a_link_sends_again_are_those_of_the_kernel_and_a_finding() -> Result<()> {
+fn retransmitted_segments_of_a_link_equal_those_of_the_kernel_and_are_a_finding() -> Result<()> {
     let link = Link::new()?;
     let [small, ..] = streams(link.robot.address());
     let stream = Stream {
@@ -309,7 +310,7 @@ fn counts_on_an_interface_equal_the_logs() -> Result<()> {
     let (mut publisher, mut subscriber) = pair(&link.robot, &link.monitor, &small)?;
     let agent = &observer.agent;
     agent.scrape_until("both endpoints", |page| knows(page, &small.topic))?;
-    publisher.go()?;
+    publisher.start_sending()?;
     publisher.wait_sent(PATIENCE)?;
     let page = agent.settled_scrape(&small.topic, small.count)?;
     subscriber.process.terminate()?;
@@ -343,7 +344,7 @@ impl Connections {
 }
 
 impl Carrier for Connections {
-    fn carry(&mut self, payload: &[u8]) -> Result<()> {
+    fn send(&mut self, payload: &[u8]) -> Result<()> {
         self.turn = (self.turn + 1) % self.ends.len();
         let [client, _] = &mut self.ends[self.turn];
         client.write_all(&framed(payload))?;
@@ -355,7 +356,7 @@ impl Carrier for Connections {
 fn a_thousand_connections_are_read() -> Result<()> {
     const CONNECTIONS: usize = 1000;
     const ROUNDS: usize = 5;
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let observer = Observer::start(&host, &at_the_sockets_of(&host))?;
     let mut connections = Connections::open(&host, CONNECTIONS)?;
     let mut talker = Talker::new(1, "/crowd");
@@ -365,25 +366,25 @@ fn a_thousand_connections_are_read() -> Result<()> {
         page.value("ros2_topic_publishers", &[("topic", "/crowd")]) == Some(1.0)
     })?;
     let sent = CONNECTIONS * ROUNDS;
-    talk(&mut talker, &mut connections, vec![100; sent])?;
+    send_sizes(&mut talker, &mut connections, vec![100; sent])?;
     let page = agent.settled_scrape("/crowd", sent as u64)?;
     let counted = ["messages", "lost_messages", "duplicate_messages"];
     let counted = counted.map(|what| count(&page, what, "/crowd"));
     // Each one is seen where it is sent and where it arrives.
     assert_eq!(counted, [sent as u64, 0, 0], "{}", page.0);
-    nothing_was_dropped(&page)
+    check_no_drops(&page)
 }
 
 #[test]
-fn an_agent_that_comes_second_learns_the_topics_when_another_participant_joins() -> Result<()> {
-    let host = Namespace::alone()?;
+fn a_late_agent_discovers_the_topics_when_another_participant_joins() -> Result<()> {
+    let host = Namespace::isolated()?;
     let [small, ..] = streams(Ipv4Addr::LOCALHOST);
     let stream = Stream {
         count: 100_000,
         ..small
     };
     let (mut publisher, _subscriber) = pair(&host, &host, &stream)?;
-    publisher.go()?;
+    publisher.start_sending()?;
     let socket = tempfile::tempdir()?;
     let socket = socket.path().join("api.sock");
     let api = format!("api: {{socket: {}}}\n", socket.display());

@@ -28,7 +28,7 @@ use tempfile::TempDir;
 const SIZES: [usize; 2] = [644_000, 2_720_000];
 const PATIENCE: Duration = Duration::from_secs(60);
 /// Time after which no more of a publisher's samples arrive, even if the agent lost some of them.
-const QUIET: Duration = Duration::from_secs(6);
+const LAST_SAMPLE_TIMEOUT: Duration = Duration::from_secs(6);
 /// Type as the peers announce it, in the style of ROS.
 const CLOUD: &str = "sensor_msgs/msg/PointCloud2";
 /// Offset of the points, after encapsulation, header, fields and sizes.
@@ -36,17 +36,17 @@ const DATA: usize = 52;
 
 #[test]
 fn payloads_of_fast_dds_equal_those_that_were_sent() -> Result<()> {
-    payloads_are_what_was_sent(Stack::Fast, &SIZES, at_the_sockets_of)
+    check_payloads(Stack::Fast, &SIZES, at_the_sockets_of)
 }
 
 #[test]
 fn payloads_of_cyclone_dds_equal_those_that_were_sent() -> Result<()> {
-    payloads_are_what_was_sent(Stack::Cyclone, &SIZES, at_the_sockets_of)
+    check_payloads(Stack::Cyclone, &SIZES, at_the_sockets_of)
 }
 
 #[test]
 fn payloads_of_rust_dds_equal_those_that_were_sent() -> Result<()> {
-    payloads_are_what_was_sent(Stack::Rust, &SIZES, at_the_sockets_of)
+    check_payloads(Stack::Rust, &SIZES, at_the_sockets_of)
 }
 
 #[test]
@@ -54,19 +54,19 @@ fn payloads_on_the_wire_equal_those_that_were_sent() -> Result<()> {
     // Samples are in IP fragments, and larger ones in frames of 1.4 KB. A busy machine loses parts
     // of more.
     let on_the_wire = |_: &Namespace| ON_THE_WIRE.to_owned();
-    payloads_are_what_was_sent(Stack::Fast, &[60_000, 644_000], on_the_wire)?;
-    payloads_are_what_was_sent(Stack::Cyclone, &[644_000], on_the_wire)
+    check_payloads(Stack::Fast, &[60_000, 644_000], on_the_wire)?;
+    check_payloads(Stack::Cyclone, &[644_000], on_the_wire)
 }
 
 #[test]
 fn the_last_message_of_a_transient_local_publisher_is_delivered_first() -> Result<()> {
     let on_the_wire = |_: &Namespace| ON_THE_WIRE.to_owned();
-    comes_first(Stack::Fast, at_the_sockets_of)?;
-    comes_first(Stack::Cyclone, at_the_sockets_of)?;
-    comes_first(Stack::Cyclone, on_the_wire)
+    check_first(Stack::Fast, at_the_sockets_of)?;
+    check_first(Stack::Cyclone, at_the_sockets_of)?;
+    check_first(Stack::Cyclone, on_the_wire)
 }
 
-fn comes_first(stack: Stack, source: impl Fn(&Namespace) -> String) -> Result<()> {
+fn check_first(stack: Stack, source: impl Fn(&Namespace) -> String) -> Result<()> {
     let size = SIZES[0];
     let link = Link::new()?;
     let observed = Observed::start(&link.robot, &source(&link.robot))?;
@@ -79,7 +79,7 @@ fn comes_first(stack: Stack, source: impl Fn(&Namespace) -> String) -> Result<()
     };
     let (mut publisher, _subscriber) = pair(&link.robot, &link.monitor, stack, &stream)?;
     // The kernel already knows the publisher. No client requests its topic.
-    publisher.go()?;
+    publisher.start_sending()?;
     let bytes = f64::from(u32::try_from(size)?);
     let kept = |page: &Scrape| page.sum("ros2probe_retained_bytes", &[]) == bytes;
     observed
@@ -97,7 +97,7 @@ fn comes_first(stack: Stack, source: impl Fn(&Namespace) -> String) -> Result<()
 
     let client = observed.client()?;
     let mut lines = open(&client, "topic=/points&payload=true", "/points")?;
-    let Some(News::Sample(sample, payload)) = next(&mut lines)? else {
+    let Some(StreamItem::Sample(sample, payload)) = next(&mut lines)? else {
         bail!("no sample comes first");
     };
     let pattern: Vec<u8> = (8..size).map(pattern).collect();
@@ -107,7 +107,7 @@ fn comes_first(stack: Stack, source: impl Fn(&Namespace) -> String) -> Result<()
 }
 
 /// Checks the payloads without a configured watch: one stream of samples suffices.
-fn payloads_are_what_was_sent(
+fn check_payloads(
     stack: Stack,
     sizes: &[usize],
     source: impl Fn(&Namespace) -> String,
@@ -131,40 +131,40 @@ fn payloads_are_what_was_sent(
         let client = observed.client()?;
         let mut lines = open(&client, "topic=/points&payload=true", "/points")?;
         let pattern: Vec<u8> = (8..size).map(pattern).collect();
-        publisher.go()?;
+        publisher.start_sending()?;
         let mut received = BTreeMap::new();
         let mut missed = 0;
-        let mut heard = Instant::now();
+        let mut last_item = Instant::now();
         while received.len() as u64 + missed < stream.count {
-            let next = match next_within(&mut lines, QUIET) {
+            let next = match next_within(&mut lines, LAST_SAMPLE_TIMEOUT) {
                 // The agent may have seen neither the last samples nor a HEARTBEAT after them.
-                Ok(Some(News::Nothing)) | Err(_)
+                Ok(Some(StreamItem::Nothing)) | Err(_)
                     if !lossless_metering
                         && publisher.log()?.sequences("pub").len() as u64 == stream.count
                         && dropped(&observed.agent.scrape()?) > 0.0 =>
                 {
                     break;
                 }
-                Ok(Some(News::Nothing)) if heard.elapsed() < PATIENCE => continue,
-                Ok(Some(News::Nothing)) => Err(anyhow!("no sample")),
+                Ok(Some(StreamItem::Nothing)) if last_item.elapsed() < PATIENCE => continue,
+                Ok(Some(StreamItem::Nothing)) => Err(anyhow!("no sample")),
                 next => next,
             };
-            heard = Instant::now();
+            last_item = Instant::now();
             let next = next.with_context(|| match observed.agent.scrape() {
                 Ok(page) => format!(
                     "{stack:?} {size}: after {:?} and {missed} missed: {}",
                     received.keys(),
-                    page.doubts()
+                    page.doubted_jumps()
                 ),
                 Err(error) => error.to_string(),
             });
             let (sample, payload) = match next?.context("the stream ended")? {
-                News::Sample(sample, payload) => (sample, payload),
-                News::Missed(facts) => {
+                StreamItem::Sample(sample, payload) => (sample, payload),
+                StreamItem::Missed(facts) => {
                     missed += facts.samples;
                     continue;
                 }
-                News::Nothing => continue,
+                StreamItem::Nothing => continue,
             };
             ensure!(sample.message_type == CLOUD && sample.size as usize == payload.len());
             ensure!(payload.len() == size, "{} of {size} bytes", payload.len());
@@ -181,13 +181,13 @@ fn payloads_are_what_was_sent(
             received.keys().all(|number| sent.contains(number)),
             "{sent:?}"
         );
-        all_is_there_or_counted(&observed, received.len(), missed, lossless_metering)?;
+        check_all_or_counted(&observed, received.len(), missed, lossless_metering)?;
     }
     Ok(())
 }
 
 /// Checks that each sample is delivered or reported as missing.
-fn all_is_there_or_counted(
+fn check_all_or_counted(
     observed: &Observed<'_>,
     received: usize,
     missed: u64,
@@ -198,9 +198,14 @@ fn all_is_there_or_counted(
     ensure!(
         missed == 0 || dropped > 0.0,
         "{missed} missed: {}",
-        page.doubts()
+        page.doubted_jumps()
     );
-    ensure!(received >= 10, "{} of 40: {}", received, page.doubts());
+    ensure!(
+        received >= 10,
+        "{} of 40: {}",
+        received,
+        page.doubted_jumps()
+    );
     let label = [("topic", "/points")];
     let counted = page.sum("ros2_topic_messages_total", &label);
     let lost = page.sum("ros2_topic_lost_messages_total", &label);
@@ -209,7 +214,7 @@ fn all_is_there_or_counted(
         ensure!(
             (counted, lost) == (40.0, 0.0),
             "{counted}, {lost}: {}",
-            page.doubts()
+            page.doubted_jumps()
         );
     }
     Ok(())
@@ -267,7 +272,7 @@ fn open<'a>(client: &'a client::Agent, query: &str, topic: &str) -> Result<Lines
 }
 
 /// An item of a stream.
-enum News {
+enum StreamItem {
     Sample(Sample, Vec<u8>),
     Missed(Missed),
     /// Only the clock advanced.
@@ -275,11 +280,11 @@ enum News {
 }
 
 /// Returns the next sample with its payload, or the next report of missing ones; `None` at the end.
-fn next(lines: &mut Lines<'_>) -> Result<Option<News>> {
+fn next(lines: &mut Lines<'_>) -> Result<Option<StreamItem>> {
     next_within(lines, PATIENCE)
 }
 
-fn next_within(lines: &mut Lines<'_>, patience: Duration) -> Result<Option<News>> {
+fn next_within(lines: &mut Lines<'_>, patience: Duration) -> Result<Option<StreamItem>> {
     let deadline = Instant::now() + patience;
     loop {
         let line = match lines.line_within(PATIENCE)? {
@@ -290,11 +295,11 @@ fn next_within(lines: &mut Lines<'_>, patience: Duration) -> Result<Option<News>
         match serde_json::from_slice(&line)? {
             Line::Sample(sample) => {
                 let len = sample.payload_bytes.context("no payload")? as usize;
-                return Ok(Some(News::Sample(sample, lines.bytes(len)?.to_vec())));
+                return Ok(Some(StreamItem::Sample(sample, lines.bytes(len)?.to_vec())));
             }
-            Line::Missed(missed) => return Ok(Some(News::Missed(missed))),
+            Line::Missed(missed) => return Ok(Some(StreamItem::Missed(missed))),
             Line::Clock(_) if Instant::now() < deadline => {}
-            Line::Clock(_) => return Ok(Some(News::Nothing)),
+            Line::Clock(_) => return Ok(Some(StreamItem::Nothing)),
             other => bail!("{other:?}"),
         }
     }
@@ -355,7 +360,7 @@ impl<'a> Observed<'a> {
 /// the subscriptions of closed clients end, and memory stays bounded.
 #[test]
 fn stopped_and_killed_readers_delay_no_other_reader() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let limits = "limits: {payload_bytes: 8388608, subscriptions: 12}\n";
     let observed = Observed::start(&host, &format!("{limits}{}", at_the_sockets_of(&host)))?;
     let stream = Stream {
@@ -378,7 +383,7 @@ fn stopped_and_killed_readers_delay_no_other_reader() -> Result<()> {
         observed.agent.scrape_until("that many", shows)
     };
     open_are(10.0)?;
-    publisher.go()?;
+    publisher.start_sending()?;
     let mut readers = readers.into_iter();
     for number in 1..=160 {
         if number == 40 {
@@ -386,9 +391,11 @@ fn stopped_and_killed_readers_delay_no_other_reader() -> Result<()> {
             killed.0.kill()?;
         }
         match next(&mut lines)?.context("the stream ended")? {
-            News::Sample(sample, _) => ensure!(sample.sequence_number == number, "{sample:?}"),
-            News::Missed(missed) => bail!("{number}: {missed:?}"),
-            News::Nothing => bail!("{number}: no sample"),
+            StreamItem::Sample(sample, _) => {
+                ensure!(sample.sequence_number == number, "{sample:?}");
+            }
+            StreamItem::Missed(missed) => bail!("{number}: {missed:?}"),
+            StreamItem::Nothing => bail!("{number}: no sample"),
         }
     }
     open_are(9.0)?;
@@ -399,7 +406,7 @@ fn stopped_and_killed_readers_delay_no_other_reader() -> Result<()> {
     ensure!(
         page.sum("ros2_topic_messages_total", &label) == 160.0,
         "{}",
-        page.doubts()
+        page.doubted_jumps()
     );
     ensure!(page.sum("ros2_topic_lost_messages_total", &label) == 0.0);
     let queued = page.sum("ros2probe_queued_bytes", &[]);
@@ -460,7 +467,7 @@ fn the_cost_of_a_stream_of_point_clouds_is_measured() -> Result<()> {
         let client = observed.client()?;
         drop(open(&client, "topic=/points", "/points")?);
         let _reader = Reader::start(&observed.socket, "/samples?topic=/points&payload=true")?;
-        publisher.go()?;
+        publisher.start_sending()?;
         std::thread::sleep(Duration::from_secs(2));
         let before = Usage::of(observed.agent.process.pid())?;
         std::thread::sleep(WINDOW);
@@ -474,7 +481,7 @@ fn the_cost_of_a_stream_of_point_clouds_is_measured() -> Result<()> {
             used.memory.unreclaimable as f64 / 1e6,
             page.sum("ros2_topic_messages_total", &label),
             stream.count,
-            page.doubts(),
+            page.doubted_jumps(),
         );
     }
     Ok(())

@@ -24,7 +24,7 @@ const PATIENCE: Duration = Duration::from_secs(60);
 /// Minimum share of samples seen that a test requires, on a machine with other load.
 const COVERAGE: f64 = 0.1;
 /// Maximum number of attempts to start a pair before the agent has its names.
-const MEETINGS: u32 = 12;
+const MAX_START_ATTEMPTS: u32 = 12;
 
 // Coverage: shared memory, sampled | Fast DDS 2.9 | - | counted
 #[test]
@@ -44,7 +44,7 @@ fn four_streams_in_shared_memory_are_counted_as_they_were_sent() -> Result<()> {
         linger: 60.0,
         ..shared()
     });
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let host = Host::new(&network)?;
     let directory = tempfile::tempdir()?;
     let agent = start_agent(&network, directory.path())?;
@@ -52,7 +52,7 @@ fn four_streams_in_shared_memory_are_counted_as_they_were_sent() -> Result<()> {
     let cpu = |page: &Scrape| page.sum("ros2probe_shm_cpu_seconds_total", &[]);
     let (before, began) = (cpu(&agent.scrape()?), Instant::now());
     for (publisher, _) in &mut pairs {
-        publisher.go()?;
+        publisher.start_sending()?;
     }
     let imu = [("topic", "/imu")];
     agent.scrape_until("the publisher's rate", |page| {
@@ -74,7 +74,7 @@ fn four_streams_in_shared_memory_are_counted_as_they_were_sent() -> Result<()> {
     let half = agent.settled_scrape("/imu", 0)?;
     let began = Instant::now();
     for (publisher, _) in &mut pairs {
-        publisher.go()?;
+        publisher.start_sending()?;
     }
     for ((publisher, _), stream) in pairs.iter_mut().zip(&streams) {
         publisher.wait_sent(PATIENCE)?;
@@ -133,16 +133,17 @@ fn a_topic_of_two_middlewares_with_a_remote_subscriber_has_all_its_sources() -> 
     let directory = tempfile::tempdir()?;
     let agent = start_agent(&link.robot, directory.path())?;
     let streams = Streams::of_two_middlewares();
-    let [mut publisher, mut talker, ..] = streams.meet(&host, &link.monitor, &agent)?;
+    let [mut publisher, mut talker, ..] =
+        streams.start_until_known(&host, &link.monitor, &agent)?;
     for _ in 0..2 {
-        publisher.go()?;
-        talker.go()?;
+        publisher.start_sending()?;
+        talker.start_sending()?;
         std::thread::sleep(Duration::from_secs(1));
     }
     // The messages before the first one that the agent saw cannot be counted.
     let before = agent.settled_scrape("/imu", 0)?;
-    publisher.go()?;
-    talker.go()?;
+    publisher.start_sending()?;
+    talker.start_sending()?;
     publisher.wait_sent(PATIENCE)?;
     talker.wait_sent(PATIENCE)?;
     let page = agent.settled_scrape("/points", streams.one.count)?;
@@ -207,8 +208,13 @@ impl Streams {
     }
 
     /// Starts the peers, publishers first, and repeats this until the agent has all endpoints.
-    fn meet(&self, host: &Host<'_>, remote: &Namespace, agent: &Agent<'_>) -> Result<[Peer; 5]> {
-        for _ in 0..MEETINGS {
+    fn start_until_known(
+        &self,
+        host: &Host<'_>,
+        remote: &Namespace,
+        agent: &Agent<'_>,
+    ) -> Result<[Peer; 5]> {
+        for _ in 0..MAX_START_ATTEMPTS {
             let mut peers = [
                 host.launch(Role::Publisher, &self.both)?,
                 host.launch_stack(Stack::Cyclone, Role::Publisher, &self.cyclone)?,
@@ -251,7 +257,7 @@ fn shows_all_pairs(page: &Scrape) -> bool {
 // Coverage: data sharing | Fast DDS 2.9 | - | named
 #[test]
 fn messages_in_shared_histories_are_not_seen_and_the_agent_reports_it() -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let host = Host::new(&network)?;
     let directory = tempfile::tempdir()?;
     let agent = start_agent(&network, directory.path())?;
@@ -270,7 +276,7 @@ fn messages_in_shared_histories_are_not_seen_and_the_agent_reports_it() -> Resul
 
 #[test]
 fn an_agent_without_shared_memory_to_read_takes_almost_no_cpu() -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let host = Host::new(&network)?;
     let directory = tempfile::tempdir()?;
     let agent = start_agent(&network, directory.path())?;
@@ -296,7 +302,7 @@ fn an_agent_without_shared_memory_to_read_takes_almost_no_cpu() -> Result<()> {
 #[ignore = "takes two minutes and prints a figure"]
 fn the_ratio_of_starts_after_which_all_names_are_known_is_measured() -> Result<()> {
     const STARTS: usize = 20;
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let host = Host::new(&network)?;
     let directory = tempfile::tempdir()?;
     let agent = start_agent(&network, directory.path())?;
@@ -322,7 +328,7 @@ fn the_ratio_of_starts_after_which_all_names_are_known_is_measured() -> Result<(
 #[ignore = "takes two minutes and a quiet machine to mean anything"]
 fn losses_and_delays_of_peers_are_measured_with_and_without_an_agent() -> Result<()> {
     const PAIRS: usize = 10;
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let host = Host::new(&network)?;
     let directory = tempfile::tempdir()?;
     let stream = Stream {
@@ -340,7 +346,7 @@ fn losses_and_delays_of_peers_are_measured_with_and_without_an_agent() -> Result
             _ => None,
         };
         let (mut publisher, mut subscriber) = host.pair(&stream)?;
-        publisher.go()?;
+        publisher.start_sending()?;
         publisher.wait_sent(PATIENCE)?;
         subscriber
             .process
@@ -379,8 +385,8 @@ fn losses_and_delays_of_peers_are_measured_with_and_without_an_agent() -> Result
 }
 
 #[test]
-fn a_nearly_full_directory_is_a_finding_until_there_is_room() -> Result<()> {
-    let network = Namespace::alone()?;
+fn a_nearly_full_directory_is_a_finding_until_space_is_free() -> Result<()> {
+    let network = Namespace::isolated()?;
     let host = Host::new(&network)?;
     let directory = tempfile::tempdir()?;
     let agent = start_agent(&network, directory.path())?;
@@ -397,7 +403,7 @@ fn a_nearly_full_directory_is_a_finding_until_there_is_room() -> Result<()> {
 
 #[test]
 fn files_of_killed_nodes_are_a_finding_until_they_are_removed() -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let host = Host::new(&network)?;
     let directory = tempfile::tempdir()?;
     let agent = start_agent(&network, directory.path())?;
@@ -407,7 +413,7 @@ fn files_of_killed_nodes_are_a_finding_until_they_are_removed() -> Result<()> {
         ..shared()
     };
     let (mut publisher, mut subscriber) = host.pair(&stream)?;
-    publisher.go()?;
+    publisher.start_sending()?;
     std::thread::sleep(Duration::from_secs(6));
     assert_eq!(faults(&agent.scrape()?), 0.0);
     for peer in [&mut publisher, &mut subscriber] {
@@ -424,7 +430,7 @@ fn files_of_killed_nodes_are_a_finding_until_they_are_removed() -> Result<()> {
 
 #[test]
 fn nodes_with_different_directories_in_one_network_are_a_finding() -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let hosts = [Host::new(&network)?, Host::new(&network)?];
     let directory = tempfile::tempdir()?;
     let agent = start_agent(&network, directory.path())?;
@@ -501,7 +507,7 @@ impl<'n> Host<'n> {
     /// are announced once, and their memory is reused within a moment. A tap without CPU time in
     /// that moment misses them.
     fn known_pairs(&self, agent: &Agent<'_>, streams: &[Stream]) -> Result<Vec<(Peer, Peer)>> {
-        for attempt in 1..=MEETINGS {
+        for attempt in 1..=MAX_START_ATTEMPTS {
             let pairs: Result<Vec<_>> = streams.iter().map(|stream| self.pair(stream)).collect();
             let pairs = pairs?;
             let deadline = Instant::now() + Duration::from_secs(3);
@@ -519,7 +525,7 @@ impl<'n> Host<'n> {
             }
             std::thread::sleep(Duration::from_secs(1));
         }
-        bail!("their names did not become known in {MEETINGS} attempts")
+        bail!("their names did not become known in {MAX_START_ATTEMPTS} attempts")
     }
 
     /// Returns the files of this host's shared memory that the agent has open.
@@ -598,7 +604,7 @@ fn start_agent<'a>(host: &'a Namespace, directory: &Path) -> Result<Agent<'a>> {
 fn run(agent: &Agent<'_>, mut publisher: Peer, stream: &Stream) -> Result<Scrape> {
     // Waits until names and endpoints have settled.
     std::thread::sleep(Duration::from_secs(1));
-    publisher.go()?;
+    publisher.start_sending()?;
     publisher.wait_sent(PATIENCE)?;
     let sent = publisher.log()?.sequences("pub").len() as u64;
     ensure!(

@@ -27,7 +27,7 @@ const SAMPLES: u64 = 600;
 /// agent may get no CPU during the burst.
 const RING: u64 = 4 << 20;
 const BURST: u64 = 50_000;
-const FASTER_THAN_IT_GOES: f64 = 1e6;
+const UNREACHABLE_RATE: f64 = 1e6;
 
 // Coverage: shared memory, with uprobes | Fast DDS 2.9 | - | exact
 #[test]
@@ -49,7 +49,7 @@ fn every_message_is_seen_and_breakpoints_end_with_a_killed_agent() -> Result<()>
         let Code { in_memory, in_file } = code(peer)?;
         assert_ne!(in_memory, in_file);
     }
-    publisher.go()?;
+    publisher.start_sending()?;
     publisher.wait_sent(PATIENCE)?;
     let page = counted(&agent, "/imu", SAMPLES)?;
     assert_eq!(received(&mut subscriber, 0, SAMPLES)?, SAMPLES);
@@ -63,7 +63,7 @@ fn every_message_is_seen_and_breakpoints_end_with_a_killed_agent() -> Result<()>
     subscriber.process.terminate()?;
 
     let burst = Stream {
-        rate: FASTER_THAN_IT_GOES,
+        rate: UNREACHABLE_RATE,
         count: BURST + SAMPLES,
         stretch: BURST,
         depth: 1000,
@@ -75,7 +75,7 @@ fn every_message_is_seen_and_breakpoints_end_with_a_killed_agent() -> Result<()>
     };
     let (mut publisher, mut subscriber) = host.pair(&burst)?;
     known(&agent, "/burst")?;
-    publisher.go()?;
+    publisher.start_sending()?;
     let page = counted(&agent, "/burst", BURST)?;
     assert_eq!(page.sum("ros2_topic_lost_messages_total", &[]), 0.0);
     // Shared memory was not polled, and no message was sampled.
@@ -92,7 +92,7 @@ fn every_message_is_seen_and_breakpoints_end_with_a_killed_agent() -> Result<()>
             Ok(in_memory == in_file)
         })?;
     }
-    publisher.go()?;
+    publisher.start_sending()?;
     publisher.wait_sent(PATIENCE)?;
     // During the burst Fast DDS overwrites unread samples, with or without an agent.
     assert_eq!(received(&mut subscriber, BURST, SAMPLES)?, SAMPLES);
@@ -136,7 +136,7 @@ fn with_a_broker_an_agent_without_rights_sees_every_message_in_every_start_order
         };
         let (mut publisher, mut subscriber) = host.pair(&stream)?;
         known(&agent, "/imu")?;
-        publisher.go()?;
+        publisher.start_sending()?;
         counted(&agent, "/imu", SAMPLES / 2)?;
 
         // The breakpoints belong to the agent, and a new broker continues.
@@ -157,7 +157,7 @@ fn with_a_broker_an_agent_without_rights_sees_every_message_in_every_start_order
         );
         let _broker = start_broker(directory.path())?;
         wait_until("the new broker attaches", is_able)?;
-        publisher.go()?;
+        publisher.start_sending()?;
         counted(&agent, "/imu", SAMPLES)?;
         ensure!(
             received(&mut subscriber, 0, SAMPLES)? == SAMPLES,
@@ -292,7 +292,7 @@ fn a_recreated_cgroup_is_sampled_and_the_reason_is_reported() -> Result<()> {
             (publisher, subscriber) = host.pair(&stream)?;
         }
     }
-    publisher.go()?;
+    publisher.start_sending()?;
     publisher.wait_sent(PATIENCE)?;
     assert_eq!(received(&mut subscriber, 0, SAMPLES)?, SAMPLES);
     let page = agent.settled_scrape("/imu", SAMPLES)?;
@@ -325,7 +325,7 @@ struct Host {
 
 impl Host {
     fn new() -> Result<Host> {
-        let network = Namespace::alone()?;
+        let network = Namespace::isolated()?;
         let script = "mount -t tmpfs -o size=64m,mode=1777 shm /dev/shm && echo ready && exec cat";
         let arguments = ["--mount", "sh", "-c", script];
         let mut keeper = Process::start(&network.on_network(), "unshare", arguments)?;

@@ -26,11 +26,11 @@ use ros2probe_model::report::snapshot::Snapshot;
 use ros2probe_testing::harness::PREFIX;
 use ros2probe_testing::harness::cgroup::Cgroup;
 use ros2probe_testing::harness::network::Namespace;
-use ros2probe_testing::harness::witness::{Testimony, Witness};
+use ros2probe_testing::harness::witness::{Witness, WitnessReport};
 use ros2probe_wire::Expansion;
 
 /// Configuration that watches every topic, including hidden ones.
-const EVERYTHING: &str = "watch: ['/**', '/**/_action/*', '/**/_service_event']\n";
+const ALL_TOPICS: &str = "watch: ['/**', '/**/_action/*', '/**/_service_event']\n";
 /// Longer captures run only if `ROS2PROBE_FIXTURES` names them.
 const LONGEST: Duration = Duration::from_secs(60);
 /// Captures are sent in half their time. Windows in which gaps may still be filled are long enough.
@@ -94,7 +94,7 @@ struct Sending<'a> {
 impl<'a> Sending<'a> {
     /// Prepares a capture; `None` if it cannot be sent again, or takes too long.
     fn prepare(number: usize, capture: &'a Path) -> Result<Option<Self>> {
-        let host = Namespace::alone()?;
+        let host = Namespace::isolated()?;
         let cgroup = Cgroup::create(&format!("{PREFIX}-{}-source{number}", std::process::id()))?;
         let injection = Injection::of(capture, &host, &cgroup)
             .with_context(|| capture.display().to_string())?;
@@ -111,15 +111,15 @@ impl<'a> Sending<'a> {
     /// Compares the sources, and returns a summary.
     fn compare(&self) -> Result<String> {
         let path = self.cgroup.path().display();
-        let at_sockets = format!("{EVERYTHING}capture: {{source: host, cgroup: {path}}}\n");
-        let on_wire = format!("{EVERYTHING}capture: {{source: wire}}\n");
+        let at_sockets = format!("{ALL_TOPICS}capture: {{source: host, cgroup: {path}}}\n");
+        let on_wire = format!("{ALL_TOPICS}capture: {{source: wire}}\n");
         let start = |configuration: &str| Witness::start_on(&self.host, configuration);
         let mut witnesses = [("host", start(&at_sockets)?), ("wire", start(&on_wire)?)];
         let sent = self.injection.run(SPEED)?;
         std::thread::sleep(SETTLE);
         let file = Counts::replayed(self.capture)?;
         for (source, witness) in &mut witnesses {
-            let seen = Counts::witnessed(&witness.finish()?)?;
+            let seen = Counts::counts_of_witness(&witness.finish()?)?;
             let agreed = file.ensure_equal(&seen);
             agreed.with_context(|| format!("file and {source}"))?;
         }
@@ -137,7 +137,7 @@ struct Counts {
 
 impl Counts {
     fn replayed(capture: &Path) -> Result<Counts> {
-        let config = Config::parse(EVERYTHING.as_bytes())
+        let config = Config::parse(ALL_TOPICS.as_bytes())
             .ok()
             .context("the watchlist")?;
         let mut observer = Observer::new(Settings::default());
@@ -151,7 +151,7 @@ impl Counts {
         Ok(Counts::of(&observer.snapshot(feed.last()), losses))
     }
 
-    fn witnessed(testimony: &Testimony) -> Result<Counts> {
+    fn counts_of_witness(testimony: &WitnessReport) -> Result<Counts> {
         testimony.ensure_complete()?;
         Ok(Counts::of(&testimony.end, testimony.losses.iter()))
     }

@@ -129,7 +129,7 @@ struct Robot<'n> {
 }
 
 fn one_order(stack: Stack, order: &[Part]) -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let mut robot = Robot {
         host: &host,
         stack,
@@ -243,7 +243,10 @@ impl<'n> Robot<'n> {
 
     /// Sends a stretch and waits until the subscriber has it.
     fn send(&mut self) -> Result<()> {
-        self.publisher.as_mut().context("no publisher")?.go()?;
+        self.publisher
+            .as_mut()
+            .context("no publisher")?
+            .start_sending()?;
         self.sent += STRETCH;
         let deadline = Instant::now() + PATIENCE;
         let subscriber = self.subscriber.as_ref().context("no subscriber")?;
@@ -330,7 +333,7 @@ impl<'n> Robot<'n> {
             }
             if Instant::now() > deadline {
                 let page = self.agent()?.scrape()?;
-                bail!("found {found:#?}\n{}", page.doubts());
+                bail!("found {found:#?}\n{}", page.doubted_jumps());
             }
             std::thread::sleep(Duration::from_millis(200));
         }

@@ -244,7 +244,7 @@ impl Nodes {
     }
 
     fn go(&mut self) -> Result<()> {
-        self.publishers.iter_mut().try_for_each(Peer::go)
+        self.publishers.iter_mut().try_for_each(Peer::start_sending)
     }
 
     fn all(&self) -> impl Iterator<Item = &Peer> {

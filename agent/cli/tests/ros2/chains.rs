@@ -65,7 +65,7 @@ fn hops_over_shared_memory_with_the_uprobe_have_the_durations_that_the_nodes_log
 }
 
 fn agrees_with_the_nodes(middleware: Middleware) -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let host = Host::new(&network, middleware)?;
     let capture = host.file("chain.pcap");
     let recorded = matches!(middleware, Middleware::Cyclone | Middleware::FastUdp);

@@ -57,7 +57,7 @@ fn cpu(process: Option<&Process>) -> Result<Duration> {
 }
 
 fn measure(workload: &Workload, observer: Observer) -> Result<Cost> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
     let agent = match observer {
         Observer::Agent => Some(host.agent("watch: ['/**']\n")?),

@@ -34,12 +34,15 @@ const OF_ALL: [&str; 2] = ["/rosout", "/parameter_events"];
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
 fn a_router_lists_the_graph_that_ros2_prints_and_no_node_appears() -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
     let refused = rp(&host, &[])?;
-    let said = String::from_utf8_lossy(&refused.stderr).into_owned();
-    ensure!(refused.status.code() == Some(1), "{said}");
-    ensure!(said.contains("no Zenoh router at localhost:7447"), "{said}");
+    let output_text = String::from_utf8_lossy(&refused.stderr).into_owned();
+    ensure!(refused.status.code() == Some(1), "{output_text}");
+    ensure!(
+        output_text.contains("no Zenoh router at localhost:7447"),
+        "{output_text}"
+    );
 
     let router = host.router("")?;
     let nodes = start(&host)?;
@@ -88,7 +91,7 @@ fn a_router_lists_the_graph_that_ros2_prints_and_no_node_appears() -> Result<()>
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
 fn routers_of_other_configurations_answer_or_are_refused_by_name() -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
     let users = host.path("users.txt");
     fs::write(&users, "user:password")?;
@@ -359,8 +362,8 @@ impl<'h> Sniffer<'h> {
         let words = [
             "-i", "lo", "-n", "-U", "-Z", "root", "-w", &file, "tcp", "port", PORT,
         ];
-        let said = fs::File::create(&errors)?.into();
-        let process = Process::start_with(&host.network.inside(), "tcpdump", words, said)?;
+        let output_text = fs::File::create(&errors)?.into();
+        let process = Process::start_with(&host.network.inside(), "tcpdump", words, output_text)?;
         wait_until("tcpdump listens", || {
             Ok(fs::read_to_string(&errors)?.contains("listening on"))
         })?;

@@ -60,7 +60,7 @@ fn with_cyclone_dds_transforms_print_as_in_tf2_echo() -> Result<()> {
 }
 
 fn prints_as_tf2_echo(middleware: Middleware) -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let host = Host::new(&network, middleware)?;
     let _agent = host.agent("")?;
     let mut broadcaster = host.python("frames.py", &[])?;

@@ -37,7 +37,7 @@ fn echo(host: &Host<'_>, name: &str, reliability: &str) -> Result<Process> {
 #[test]
 #[ignore = "needs ROS 2 with rmw_fastrtps_cpp, ros2bag, rosbag2_storage_mcap: make test-ros2"]
 fn a_finding_causes_a_bag_of_the_seconds_around_it_that_ros2_plays() -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let host = Host::new(&network, Middleware::Cyclone)?;
     let bags = host.file("bags");
     let agent = host.agent(&format!(
@@ -109,8 +109,16 @@ fn plays(host: &Host<'_>, bag: &Path, count: usize) -> Result<()> {
     let mut player = ros2(host, "player", &["bag", "play", &bag, "--delay", "5"])?;
     player.wait(PATIENCE)?;
     let output = |name| fs::read_to_string(host.file(name)).unwrap_or_default();
-    let heard = || output("listener").matches("data: hello").count();
-    let heard_all = wait_until("the listener heard all messages", || Ok(heard() == count));
+    let received_messages = || output("listener").matches("data: hello").count();
+    let heard_all = wait_until("the listener heard all messages", || {
+        Ok(received_messages() == count)
+    });
     drop(listener);
-    heard_all.with_context(|| format!("{} of {count}: {}", heard(), output("player.err")))
+    heard_all.with_context(|| {
+        format!(
+            "{} of {count}: {}",
+            received_messages(),
+            output("player.err")
+        )
+    })
 }

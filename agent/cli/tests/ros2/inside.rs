@@ -46,7 +46,7 @@ fn messages_over_zenoh_equal_the_counts_of_the_nodes() -> Result<()> {
 /// publisher starts after it. Then the publisher is killed and replaced, and finally the agent is
 /// killed.
 fn agrees_with_the_nodes(middleware: Middleware) -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let host = Host::new(&network, middleware)?;
     let router = (middleware == Middleware::Zenoh).then(|| host.router(""));
     let router = router.transpose()?;
@@ -88,7 +88,7 @@ fn agrees_with_the_nodes(middleware: Middleware) -> Result<()> {
 #[test]
 #[ignore = "needs ROS 2 with rmw_fastrtps_cpp, intra_process_demo: make test-ros2"]
 fn receptions_within_a_process_equal_the_number_that_the_demo_prints() -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let host = Host::new(&network, Middleware::FastExact("auto"))?;
     let agent = agent(&host)?;
     let line = "exec timeout -s INT 12 ros2 run intra_process_demo two_node_pipeline > $1 2>&1";
@@ -119,7 +119,7 @@ fn receptions_within_a_process_equal_the_number_that_the_demo_prints() -> Result
 #[test]
 #[ignore = "needs ROS 2 with rmw_fastrtps_cpp, demo_nodes_cpp: make test-ros2"]
 fn callbacks_have_the_period_of_their_timer_and_the_name_of_their_node() -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let host = Host::new(&network, Middleware::Cyclone)?;
     // The talker runs before the agent, the listener starts after it.
     let talk = "exec ros2 run demo_nodes_cpp talker > $1 2>&1";

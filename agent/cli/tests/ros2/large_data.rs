@@ -52,7 +52,7 @@ fn doctor(host: &Host<'_>) -> Result<String> {
     Ok(String::from_utf8(output.stdout)?)
 }
 
-fn nothing_was_dropped(agent: &Agent<'_>) -> Result<()> {
+fn check_no_drops(agent: &Agent<'_>) -> Result<()> {
     let page = agent.scrape()?;
     for event in ["rtps_tcp_chunks_lost", "rtps_tcp_read_gaps"] {
         let count = page.sum("ros2probe_filter_events_total", &[("event", event)]);
@@ -91,7 +91,7 @@ fn counts_on_both_hosts_equal_the_log_of_the_subscription() -> Result<()> {
         for agent in &agents {
             let counted = messages(agent, topic)?;
             ensure!(counted == count as f64, "{topic}: {counted}");
-            nothing_was_dropped(agent)?;
+            check_no_drops(agent)?;
         }
     }
     Ok(())
@@ -99,7 +99,7 @@ fn counts_on_both_hosts_equal_the_log_of_the_subscription() -> Result<()> {
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_fastrtps_cpp, type_description_interfaces: make test-ros2"]
-fn an_agent_that_starts_last_learns_the_topics_from_a_command() -> Result<()> {
+fn a_late_agent_discovers_the_topics_through_a_command() -> Result<()> {
     let link = Link::new()?;
     let robot = Host::new(&link.robot, Middleware::FastLargeData)?;
     let base = Host::new(&link.monitor, Middleware::FastLargeData)?;
@@ -158,7 +158,7 @@ fn a_restarted_subscription_counts_from_its_start() -> Result<()> {
     println!("logged {log:?}");
     ensure!(log.received >= 1000 && log.missing == 0, "{log:?}");
     agrees(&agent, "/imu", "/again", log)?;
-    nothing_was_dropped(&agent)
+    check_no_drops(&agent)
 }
 
 /// Publishes 1000 messages after `published` ones, and checks that the agent counts what arrives.
@@ -181,5 +181,5 @@ fn counts_the_next(
     agrees(agent, "/imu", "/far", expected)?;
     let counted = messages(agent, "/imu")? - counted;
     ensure!(counted == 1000.0, "{counted}");
-    nothing_was_dropped(agent)
+    check_no_drops(agent)
 }

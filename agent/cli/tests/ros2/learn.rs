@@ -21,18 +21,18 @@ const LEARNS: Duration = Duration::from_secs(40);
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_fastrtps_cpp, demo_nodes_cpp: make test-ros2"]
-fn fast_dds_with_shared_memory_meets_the_expectations_learnt_from_it() -> Result<()> {
-    meets_what_was_learnt(Middleware::FastExact("auto"))
+fn fast_dds_with_shared_memory_violates_no_expectation_learnt_from_it() -> Result<()> {
+    check_learnt(Middleware::FastExact("auto"))
 }
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_cyclonedds_cpp, demo_nodes_cpp: make test-ros2"]
-fn cyclone_dds_meets_the_expectations_learnt_from_it() -> Result<()> {
-    meets_what_was_learnt(Middleware::Cyclone)
+fn cyclone_dds_violates_no_expectation_learnt_from_it() -> Result<()> {
+    check_learnt(Middleware::Cyclone)
 }
 
-fn meets_what_was_learnt(middleware: Middleware) -> Result<()> {
-    let network = Namespace::alone()?;
+fn check_learnt(middleware: Middleware) -> Result<()> {
+    let network = Namespace::isolated()?;
     let host = Host::new(&network, middleware)?;
     let agent = host.agent("")?;
     let node = |name: &str| {

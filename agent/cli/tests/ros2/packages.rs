@@ -71,7 +71,7 @@ fn ros2_probe_and_ros2_launch_run_rp() -> Result<()> {
     let candidates = String::from_utf8(completed.stdout)?;
     ensure!(candidates.trim() == "doctor", "{candidates}");
 
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let line = format!(
         "exec ros2 launch --noninteractive ros2probe agent.launch.py replay:={CAPTURE} api:=127.0.0.1:17401"
     );

@@ -68,7 +68,7 @@ fn zenoh_raises_no_alarm() -> Result<()> {
 
 fn raises_no_alarm(middleware: Middleware) -> Result<()> {
     let seconds = std::env::var("QUIET_SECONDS").map_or(Ok(SECONDS), |text| text.parse())?;
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let host = Host::new(&network, middleware)?;
     let watchlist = watchlist()?;
     let mut agent = host.agent(&watchlist)?;

@@ -44,39 +44,39 @@ const LARGE: [&str; 2] = ["/cam", "/points"];
 #[test]
 #[ignore = "needs ROS 2 with rmw_fastrtps_cpp: make test-ros2"]
 fn fast_dds_with_shared_memory_is_recorded_or_counted_to_the_message() -> Result<()> {
-    holds_what_was_published(Middleware::FastSampled)
+    check_bag(Middleware::FastSampled)
 }
 
 // Coverage: shared memory, with a uprobe | rmw_fastrtps | installed | exact
 #[test]
 #[ignore = "needs ROS 2 with rmw_fastrtps_cpp: make test-ros2"]
-fn fast_dds_with_shared_memory_and_the_uprobe_is_recorded_to_the_message() -> Result<()> {
-    holds_what_was_published(Middleware::FastExact("auto"))
+fn every_message_of_fast_dds_with_shared_memory_and_the_uprobe_is_recorded() -> Result<()> {
+    check_bag(Middleware::FastExact("auto"))
 }
 
 // Coverage: UDP | rmw_fastrtps | installed | exact
 #[test]
 #[ignore = "needs ROS 2 with rmw_fastrtps_cpp: make test-ros2"]
-fn fast_dds_over_udp_is_recorded_to_the_message() -> Result<()> {
-    holds_what_was_published(Middleware::FastUdp)
+fn every_message_of_fast_dds_over_udp_is_recorded() -> Result<()> {
+    check_bag(Middleware::FastUdp)
 }
 
 // Coverage: UDP | rmw_cyclonedds | installed | exact
 #[test]
 #[ignore = "needs ROS 2 with rmw_cyclonedds_cpp: make test-ros2"]
-fn cyclone_dds_is_recorded_to_the_message() -> Result<()> {
-    holds_what_was_published(Middleware::Cyclone)
+fn every_message_of_cyclone_dds_is_recorded() -> Result<()> {
+    check_bag(Middleware::Cyclone)
 }
 
 // Coverage: Zenoh over TCP | rmw_zenoh | installed | exact
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
-fn zenoh_is_recorded_to_the_message() -> Result<()> {
-    holds_what_was_published(Middleware::Zenoh)
+fn every_message_of_zenoh_is_recorded() -> Result<()> {
+    check_bag(Middleware::Zenoh)
 }
 
-fn holds_what_was_published(middleware: Middleware) -> Result<()> {
-    let network = Namespace::alone()?;
+fn check_bag(middleware: Middleware) -> Result<()> {
+    let network = Namespace::isolated()?;
     let robot = Robot {
         host: Host::new(&network, middleware)?,
     };
@@ -134,7 +134,7 @@ fn holds_what_was_published(middleware: Middleware) -> Result<()> {
         Middleware::FastSampled | Middleware::FastExact(_)
     );
     if has_network {
-        delivers_what_was_received(&agent, &published)?;
+        check_deliveries(&agent, &published)?;
     }
 
     let is_looked_at = middleware == Middleware::FastSampled;
@@ -156,7 +156,7 @@ fn holds_what_was_published(middleware: Middleware) -> Result<()> {
 
 /// Compares the deliveries at sockets with the log of the only subscriber, which has all messages.
 /// The last messages count once the agent has read their records.
-fn delivers_what_was_received(agent: &Agent<'_>, received: &Numbers) -> Result<()> {
+fn check_deliveries(agent: &Agent<'_>, received: &Numbers) -> Result<()> {
     let agrees = |page: &Scrape| {
         received.iter().all(|(topic, numbers)| {
             let sum = |name| page.sum(name, &[("topic", topic)]);
@@ -213,7 +213,7 @@ fn bag_holds_or_names_each_message(
             "{topic}: {} recorded, {missing} missing and {unseen} unknown of {count}, not named: {:?}: {report:#}\n{}",
             in_bag.len(),
             unnamed(&in_bag, &report, topic, count),
-            page.doubts()
+            page.doubted_jumps()
         );
         let least = match is_looked_at {
             true if LARGE.contains(&topic) => 0.0,
@@ -223,16 +223,20 @@ fn bag_holds_or_names_each_message(
         ensure!(
             in_bag.len() as f64 >= least,
             "{topic}: {report:#}\n{}",
-            page.doubts()
+            page.doubted_jumps()
         );
         let counted = page.sum("ros2_topic_messages_total", &[("topic", topic)]);
         ensure!(
             counted == (count - unseen) as f64,
             "{topic}: {counted} counted of {count}: {}",
-            page.doubts()
+            page.doubted_jumps()
         );
         let lost = page.sum("ros2_topic_lost_messages_total", &[("topic", topic)]);
-        ensure!(lost == 0.0, "{topic}: {lost} lost: {}", page.doubts());
+        ensure!(
+            lost == 0.0,
+            "{topic}: {lost} lost: {}",
+            page.doubted_jumps()
+        );
     }
     Ok(unknown_of)
 }
@@ -277,9 +281,10 @@ impl Robot<'_> {
         let output = bag.display().to_string();
         let recorder = self.rp("record", &["bag", "record", "-a", "-o", &output])?;
         wait_until("it records all topics", || {
-            let said = recorder.errors();
-            let is_subscribed = |(topic, _): &(&str, u64)| said.contains(&format!("'{topic}'"));
-            Ok(said.contains("Recording...") && TOPICS.iter().all(is_subscribed))
+            let output_text = recorder.errors();
+            let is_subscribed =
+                |(topic, _): &(&str, u64)| output_text.contains(&format!("'{topic}'"));
+            Ok(output_text.contains("Recording...") && TOPICS.iter().all(is_subscribed))
         })
         .with_context(|| recorder.errors())?;
         let mut echoes = Vec::new();

@@ -25,7 +25,7 @@ const TIME_WAIT: Duration = Duration::from_secs(75);
 const NODES: f64 = 6.0;
 const LISTENING: [(&str, &str); 1] = [("state", "listening")];
 /// Every command that needs no participant, in each of its forms.
-const FREE: &[&str] = &[
+const DAEMON_COMMANDS: &[&str] = &[
     "topic list",
     "topic list -t",
     "topic list -v",
@@ -60,8 +60,8 @@ const FREE: &[&str] = &[
     "component list",
 ];
 
-/// Some of [`FREE`], one for each kind of facts.
-const FREE_OF_ZENOH: &[&str] = &[
+/// Some of [`DAEMON_COMMANDS`], one for each kind of facts.
+const ZENOH_DAEMON_COMMANDS: &[&str] = &[
     "topic list -v --include-hidden-topics",
     "topic info -v /chatter",
     "topic info -v /fibonacci/_action/status",
@@ -91,7 +91,7 @@ fn with_zenoh_ros2_prints_the_same_and_opens_no_session() -> Result<()> {
 }
 
 fn answers_as_the_real_daemon(middleware: Middleware) -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let robot = Robot {
         host: Host::new(&network, middleware)?,
     };
@@ -238,8 +238,8 @@ impl Robot<'_> {
     /// Returns the compared commands.
     fn free(&self) -> &'static [&'static str] {
         match self.host.middleware {
-            Middleware::Zenoh => FREE_OF_ZENOH,
-            _ => FREE,
+            Middleware::Zenoh => ZENOH_DAEMON_COMMANDS,
+            _ => DAEMON_COMMANDS,
         }
     }
 
@@ -297,8 +297,8 @@ impl<'r> Sniffer<'r> {
         };
         let words = ["-i", "any", "-n", "-U", "-Z", "root", "-w", &file, filter];
         let enter = robot.host.network.inside();
-        let said = fs::File::create(&errors)?.into();
-        let process = Process::start_with(&enter, "tcpdump", words, said)?;
+        let printed = fs::File::create(&errors)?.into();
+        let process = Process::start_with(&enter, "tcpdump", words, printed)?;
         wait_until("tcpdump listens", || {
             Ok(fs::read_to_string(&errors)?.contains("listening on"))
         })?;

@@ -75,10 +75,10 @@ fn calls_over_zenoh_have_the_durations_that_the_client_logs() -> Result<()> {
 #[test]
 #[ignore = "needs ROS 2 with rmw_fastrtps_cpp: make test-ros2"]
 fn calls_over_sampled_shared_memory_are_reported_as_not_seen() -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let robot = Robot::start(&network, Middleware::FastSampled)?;
     let (agent, _server, mut client) = robot.ready()?;
-    robot.obey(&mut client, "add")?;
+    robot.run_command(&mut client, "add")?;
     std::thread::sleep(Duration::from_secs(8));
     let page = agent.scrape()?;
     ensure!(count(&page, "ros2_service_requests_total", "/add") == 0.0);
@@ -90,20 +90,20 @@ fn calls_over_sampled_shared_memory_are_reported_as_not_seen() -> Result<()> {
 }
 
 fn agrees_with_the_client(middleware: Middleware) -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let robot = Robot::start(&network, middleware)?;
     let (agent, _server, mut client) = robot.ready()?;
-    robot.obey(&mut client, "add")?;
-    robot.obey(&mut client, "goal")?;
+    robot.run_command(&mut client, "add")?;
+    robot.run_command(&mut client, "goal")?;
     let page = agent.scrape_until("all calls are answered", |page| {
         count(page, "ros2_service_answered_requests_total", "/add") == CALLS as f64
             && page.sum("ros2_action_goals_total", &[("state", "succeeded")]) == 1.0
     })?;
     robot.compare(&page)?;
-    hang(&robot, &agent, &mut client)?;
+    check_hanging_call(&robot, &agent, &mut client)?;
     // TCP delivers a repeated segment in its order, so no reply is lost.
     if !matches!(middleware, EXACT | Middleware::Zenoh) {
-        lose(&network, &agent, &mut client)?;
+        check_lost_reply(&network, &agent, &mut client)?;
     }
     let text = robot.host.rp(&["service", "info", "-v", "/add"])?;
     ensure!(text.contains("\n  Latency p50: "), "{text}");
@@ -112,8 +112,8 @@ fn agrees_with_the_client(middleware: Middleware) -> Result<()> {
 }
 
 /// Checks that a call that the server never answers becomes a finding.
-fn hang(robot: &Robot<'_>, agent: &Agent<'_>, client: &mut Process) -> Result<()> {
-    robot.obey(client, "hang")?;
+fn check_hanging_call(robot: &Robot<'_>, agent: &Agent<'_>, client: &mut Process) -> Result<()> {
+    robot.run_command(client, "hang")?;
     let page = agent.scrape_until("the call hangs", |page| {
         page.sum("ros2_diagnoses", &[("kind", "hanging_call")]) == 1.0
     })?;
@@ -123,7 +123,7 @@ fn hang(robot: &Robot<'_>, agent: &Agent<'_>, client: &mut Process) -> Result<()
 }
 
 /// Checks that a reply lost between server and client does not count until it is repaired.
-fn lose(network: &Namespace, agent: &Agent<'_>, client: &mut Process) -> Result<()> {
+fn check_lost_reply(network: &Namespace, agent: &Agent<'_>, client: &mut Process) -> Result<()> {
     let nft = |rule: &str| run(&format!("ip netns exec {} nft {rule}", network.name()));
     nft("add table ip lost")?;
     nft("add chain ip lost input { type filter hook input priority 0 ; }")?;
@@ -183,7 +183,7 @@ impl<'n> Robot<'n> {
         Ok((agent, server, client))
     }
 
-    fn obey(&self, client: &mut Process, command: &str) -> Result<()> {
+    fn run_command(&self, client: &mut Process, command: &str) -> Result<()> {
         client.write_line(command)?;
         client.wait_for("done", PATIENCE)
     }

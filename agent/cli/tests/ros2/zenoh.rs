@@ -38,7 +38,7 @@ fn discover(host: &Host<'_>) -> Result<()> {
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
 fn counts_of_small_messages_and_point_clouds_equal_the_log_of_each_subscription() -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
     let agent = host.agent(WATCH)?;
     let _router = host.router("")?;
@@ -97,7 +97,7 @@ fn counts_of_small_messages_and_point_clouds_equal_the_log_of_each_subscription(
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
 fn messages_that_zenoh_drops_for_a_stopped_subscription_count_as_its_losses() -> Result<()> {
-    let logs = beside_a_stopped_subscription("20", "2720000", [10, 60, 20])?;
+    let logs = with_stopped_subscription("20", "2720000", [10, 60, 20])?;
     ensure!(logs[0].missing > 0, "nothing was dropped: {logs:?}");
     Ok(())
 }
@@ -105,15 +105,15 @@ fn messages_that_zenoh_drops_for_a_stopped_subscription_count_as_its_losses() ->
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
 fn small_messages_that_wait_for_a_stopped_subscription_arrive_in_large_packets() -> Result<()> {
-    let logs = beside_a_stopped_subscription("1000", "300", [1000, 5000, 1000])?;
+    let logs = with_stopped_subscription("1000", "300", [1000, 5000, 1000])?;
     ensure!(logs[1].received == 7000, "{logs:?}");
     Ok(())
 }
 
 /// Publishes some messages, further ones while one of two subscriptions is stopped, and some more.
 /// Checks that the agent agrees with both, and returns the logs of the stopped one and the other.
-fn beside_a_stopped_subscription(rate: &str, bytes: &str, counts: [u64; 3]) -> Result<[Log; 2]> {
-    let network = Namespace::alone()?;
+fn with_stopped_subscription(rate: &str, bytes: &str, counts: [u64; 3]) -> Result<[Log; 2]> {
+    let network = Namespace::isolated()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
     let agent = host.agent(WATCH)?;
     let _router = host.router("")?;
@@ -143,7 +143,7 @@ fn beside_a_stopped_subscription(rate: &str, bytes: &str, counts: [u64; 3]) -> R
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
 fn a_restarted_router_removes_no_node_from_the_graph() -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
     let agent = host.agent(WATCH)?;
     let mut router = host.router("")?;

@@ -231,11 +231,11 @@ fn refused(section: &str) -> String {
         .output()
         .unwrap();
     assert!(!output.status.success(), "{section}");
-    let said = String::from_utf8(output.stderr).unwrap();
-    let said = said.lines().filter(|line| !line.contains(" INFO "));
-    let said: Vec<&str> = said.collect();
-    assert_eq!(said.len(), 1, "{said:?}");
-    said[0].to_owned()
+    let printed = String::from_utf8(output.stderr).unwrap();
+    let printed = printed.lines().filter(|line| !line.contains(" INFO "));
+    let printed: Vec<&str> = printed.collect();
+    assert_eq!(printed.len(), 1, "{printed:?}");
+    printed[0].to_owned()
 }
 
 #[test]
@@ -327,8 +327,8 @@ fn a_wrong_token_a_foreign_host_and_a_foreign_origin_are_refused_with_separate_c
     let page = format!("{local}{right}Origin: http://evil.example\r\n");
     assert_eq!(code(&page, ""), case(403, "foreign-origin"));
     let long = "x".repeat(20_000);
-    let said = format!("{local}{right}Content-Length: 20000\r\n");
-    assert_eq!(code(&said, &long), case(413, "body-too-large"));
+    let printed = format!("{local}{right}Content-Length: 20000\r\n");
+    assert_eq!(code(&printed, &long), case(413, "body-too-large"));
     let chunked = format!("{local}{right}Transfer-Encoding: chunked\r\n");
     let chunks = format!("4e20\r\n{long}\r\n0\r\n\r\n");
     assert_eq!(code(&chunked, &chunks), case(413, "body-too-large"));
@@ -386,9 +386,9 @@ fn output_in_the_book_is_current() {
         let deadline = Instant::now() + PATIENCE;
         loop {
             let output = Command::new("sh").args(["-c", &here]).output().unwrap();
-            let said = String::from_utf8(output.stdout).unwrap();
-            let counts = !said.contains("\"messages\":0,") && !said.ends_with("\"} 0\n");
-            if counts && masked(said.trim_end()) == masked(&expected) {
+            let printed = String::from_utf8(output.stdout).unwrap();
+            let counts = !printed.contains("\"messages\":0,") && !printed.ends_with("\"} 0\n");
+            if counts && masked(printed.trim_end()) == masked(&expected) {
                 break;
             }
             // Only a request without side effects can be repeated until the replay has gone far
@@ -396,7 +396,7 @@ fn output_in_the_book_is_current() {
             let may_repeat = !command.contains("-X") && Instant::now() < deadline;
             assert!(
                 may_repeat,
-                "{command}\n{said}\nbut docs/api.md has\n{expected}"
+                "{command}\n{printed}\nbut docs/api.md has\n{expected}"
             );
             std::thread::sleep(Duration::from_millis(20));
         }

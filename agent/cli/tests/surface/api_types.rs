@@ -15,7 +15,7 @@ use ros2probe_api::recordings::{
 use ros2probe_api::snapshots::{SnapshotList, WrittenSnapshot};
 use ros2probe_api::watches::{Watch, WatchRequest};
 use ros2probe_api::{live, samples};
-use ros2probe_testing::local_agent::{LocalAgent, PATIENCE, ask};
+use ros2probe_testing::local_agent::{LocalAgent, PATIENCE, call_api};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
@@ -31,7 +31,7 @@ fn asked<T: DeserializeOwned + Serialize>(
     status: u16,
 ) -> T {
     let body = serde_json::to_string(&body).unwrap();
-    let (answered, answer) = ask(agent.api, method, path, &body);
+    let (answered, answer) = call_api(agent.api, method, path, &body);
     assert_eq!(answered, status, "{method} {path}: {answer}");
     read_as(&answer)
 }

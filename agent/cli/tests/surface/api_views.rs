@@ -192,11 +192,11 @@ fn believed(name: &str, capture: &Path, line: &GraphLine) {
     let expected: BTreeMap<_, _> = line.services.clone().unwrap().into_iter().collect();
     assert_eq!(found.collect::<BTreeMap<_, _>>(), expected, "{name}");
 
-    drawn(&robot);
+    check_graph(&robot);
 }
 
 /// Checks that both ends of every edge exist, and that every listed node is in the graph.
-fn drawn(robot: &Robot) {
+fn check_graph(robot: &Robot) {
     let graph = robot.get("/graph?hidden=true");
     let vertices = graph["nodes"].as_array().unwrap();
     let ids: BTreeSet<_> = vertices
@@ -269,7 +269,7 @@ fn one_robot_is_described_as_ros2_describes_it() {
         assert!(participant["writers"].as_u64().unwrap() > 5);
     }
 
-    edges_are_there(&robot);
+    check_edges(&robot);
     wrong_queries_are_refused_with_a_hint(&robot);
 }
 
@@ -311,7 +311,7 @@ fn topics_are_described(robot: &Robot) {
     assert_eq!(request["kind"], "service_request");
 }
 
-fn edges_are_there(robot: &Robot) {
+fn check_edges(robot: &Robot) {
     let graph = robot.get("/graph");
     let edges = graph["edges"].as_array().unwrap();
     let is_there = |source: &str, target: &str, kind: &str| {

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use ros2probe_attach::client::{Broker, BrokerError};
 use ros2probe_attach::functions::{Calls, Library};
 use ros2probe_attach::mapped::{LibraryId, Use};
-use ros2probe_attach::request::{MAX_PACKET, Means, Place};
+use ros2probe_attach::request::{AttachMethod, MAX_PACKET, Place};
 use rustix::net::sockopt::{Timeout, set_socket_timeout};
 use rustix::net::{
     AddressFamily, RecvFlags, SendAncillaryBuffer, SendAncillaryMessage, SendFlags, SocketAddrUnix,
@@ -297,7 +297,7 @@ fn requests_of_a_hostile_client_outside_the_closed_list_are_refused() {
     let null = File::open("/dev/null").unwrap();
     let program = [null.as_fd()];
     let attach = |broker: &mut Broker, calls, place| {
-        refusal(broker.attach((calls, place, Means::Links), &program))
+        refusal(broker.attach((calls, place, AttachMethod::Links), &program))
     };
     // Forged paths, links and processes.
     std::os::unix::fs::symlink("/etc/shadow", &elf).unwrap();
@@ -355,7 +355,7 @@ fn requests_of_a_hostile_client_outside_the_closed_list_are_refused() {
         (
             Calls::Messages,
             process.place(Library::Tracing),
-            Means::PerfEvents,
+            AttachMethod::PerfEvents,
         ),
         &[null.as_fd(); 253],
     ));

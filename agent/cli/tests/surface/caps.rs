@@ -17,7 +17,7 @@ use ros2probe_daemon::surface::{Exposition, Format, MetricSources};
 use ros2probe_model::facts::bounded::ledger;
 use ros2probe_model::observe::input::Input;
 use ros2probe_model::observe::observer::{Observer, Settings};
-use ros2probe_testing::local_agent::{LocalAgent, PATIENCE, ask, metric};
+use ros2probe_testing::local_agent::{LocalAgent, PATIENCE, call_api, metric};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe_wire::record::{flag, guid_words, kind};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Record, Timestamp};
@@ -238,11 +238,11 @@ fn files_above_the_maximum_size_are_refused() {
         &["bag", "info", bag.to_str().unwrap()],
     ] {
         let output = rp().args(arguments).output().unwrap();
-        let said = String::from_utf8_lossy(&output.stderr);
-        assert!(!output.status.success(), "{said}");
+        let printed = String::from_utf8_lossy(&output.stderr);
+        assert!(!output.status.success(), "{printed}");
         assert!(
-            said.contains("MiB") || said.contains("larger") || said.contains("too large"),
-            "{said}"
+            printed.contains("MiB") || printed.contains("larger") || printed.contains("too large"),
+            "{printed}"
         );
     }
 }
@@ -318,7 +318,7 @@ fn chains_beyond_the_cap_of_the_configuration_are_refused() {
 fn an_api_request_beyond_a_cap_is_refused_with_the_status_of_that_cap() {
     let agent = LocalAgent::start(&mut rp(), &["--speed", "0.2"]);
     let list = "a".repeat(16_385);
-    let (status, problem) = ask(agent.api, "GET", &format!("/samples?topic={list}"), "");
+    let (status, problem) = call_api(agent.api, "GET", &format!("/samples?topic={list}"), "");
     assert_eq!(status, 422, "{problem}");
     let head = format!("X-Long: {}", "a".repeat(60 << 10));
     let request = format!(
@@ -377,16 +377,16 @@ fn only_the_latest_ended_recordings_are_listed() {
         let numbers = first..first + 4;
         for number in numbers.clone() {
             let begin = format!("{{\"name\": \"r{number}\"}}");
-            assert_eq!(ask(agent.api, "POST", "/recordings", &begin).0, 201);
+            assert_eq!(call_api(agent.api, "POST", "/recordings", &begin).0, 201);
         }
         std::thread::scope(|scope| {
             for number in numbers {
                 let path = format!("/recordings/r{number}");
-                scope.spawn(move || assert_eq!(ask(agent.api, "DELETE", &path, "").0, 200));
+                scope.spawn(move || assert_eq!(call_api(agent.api, "DELETE", &path, "").0, 200));
             }
         });
     }
-    let (_, list) = ask(agent.api, "GET", "/recordings", "");
+    let (_, list) = call_api(agent.api, "GET", "/recordings", "");
     let listed = list["recordings"].as_array().unwrap();
     let names: BTreeSet<_> = listed
         .iter()
@@ -415,7 +415,7 @@ fn a_snapshot_is_not_written_while_its_bags_have_their_maximum_size() {
         &mut rp(),
         &["--speed", "0.2", "--config", file.to_str().unwrap()],
     );
-    let (status, problem) = ask(agent.api, "POST", "/snapshots/last", "");
+    let (status, problem) = call_api(agent.api, "POST", "/snapshots/last", "");
     assert!(status >= 400, "{status} {problem}");
     assert!(problem.to_string().contains("remove some"), "{problem}");
     agent.wait_for_metric(
@@ -423,5 +423,5 @@ fn a_snapshot_is_not_written_while_its_bags_have_their_maximum_size() {
         |failed| failed == 1.0,
     );
     std::fs::remove_dir_all(&old).unwrap();
-    assert!(ask(agent.api, "POST", "/snapshots/last", "").0 < 300);
+    assert!(call_api(agent.api, "POST", "/snapshots/last", "").0 < 300);
 }

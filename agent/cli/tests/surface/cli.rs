@@ -28,11 +28,11 @@ fn file(directory: &tempfile::TempDir, name: &str, text: &str) -> PathBuf {
 /// Asserts that a command fails with one line that has these parts, without a backtrace, and with
 /// this exit code.
 fn fails_with(output: &Output, code: i32, parts: &[&str]) {
-    let said = stderr(output);
-    assert_eq!(output.status.code(), Some(code), "{said}");
-    assert_eq!(said.lines().count(), 1, "{said}");
+    let printed = stderr(output);
+    assert_eq!(output.status.code(), Some(code), "{printed}");
+    assert_eq!(printed.lines().count(), 1, "{printed}");
     for part in parts {
-        assert!(said.contains(part), "`{part}` is not in {said}");
+        assert!(printed.contains(part), "`{part}` is not in {printed}");
     }
 }
 
@@ -49,7 +49,7 @@ fn a_valid_configuration_is_reported_as_valid() {
 }
 
 #[test]
-fn a_broken_configuration_is_reported_line_by_line_and_nothing_starts() {
+fn a_broken_configuration_is_reported_line_by_line_and_prevents_the_start() {
     let directory = tempfile::tempdir().unwrap();
     let path = file(&directory, "bad.yaml", "watch:\n  - points\nlgo: info\n");
     let path = path.to_str().unwrap();
@@ -246,12 +246,12 @@ fn the_service_manager_is_notified_of_start_progress_reload_and_stop() {
     let path = directory.path().join("notify");
     let socket = UnixDatagram::bind(&path).unwrap();
     socket.set_read_timeout(Some(PATIENCE)).unwrap();
-    let hear = || {
+    let read_line = || {
         let mut buffer = [0; 512];
         let length = socket.recv(&mut buffer).unwrap();
         String::from_utf8_lossy(&buffer[..length]).into_owned()
     };
-    let wait_for = |wanted: &str| while !hear().contains(wanted) {};
+    let wait_for = |wanted: &str| while !read_line().contains(wanted) {};
 
     let config = file(&directory, "c.yaml", "watch: [/a]\n");
     let mut command = rp();
@@ -271,7 +271,7 @@ fn the_service_manager_is_notified_of_start_progress_reload_and_stop() {
 }
 
 #[test]
-fn a_pipe_in_place_of_a_file_is_refused_without_waiting() {
+fn a_pipe_instead_of_a_file_is_refused_without_waiting() {
     let directory = tempfile::tempdir().unwrap();
     let pipe = |name: &str| {
         let path = directory.path().join(name);
@@ -307,11 +307,14 @@ fn a_pipe_in_place_of_a_file_is_refused_without_waiting() {
         let mut rp = rp();
         rp.args(arguments).current_dir(directory.path());
         let (output, time) = within(rp, Duration::from_secs(10));
-        let said = String::from_utf8_lossy(&output.stderr);
-        let said = said.into_owned() + &String::from_utf8_lossy(&output.stdout);
-        println!("{arguments:?} after {time:?}: {said}");
-        assert!(!output.status.success(), "{arguments:?}: {said}");
-        assert!(said.contains("not a regular file"), "{arguments:?}: {said}");
+        let printed = String::from_utf8_lossy(&output.stderr);
+        let printed = printed.into_owned() + &String::from_utf8_lossy(&output.stdout);
+        println!("{arguments:?} after {time:?}: {printed}");
+        assert!(!output.status.success(), "{arguments:?}: {printed}");
+        assert!(
+            printed.contains("not a regular file"),
+            "{arguments:?}: {printed}"
+        );
     }
 }
 

@@ -48,7 +48,7 @@ fn the_schema_in_the_repository_equals_the_generated_one() {
 }
 
 #[test]
-fn the_shipped_file_measures_everything_and_changes_nothing_else() {
+fn the_shipped_file_only_adds_a_watch_of_all_topics() {
     let shipped = Config::parse(shipped("ros2probe.yaml").as_bytes()).unwrap();
     let patterns: Vec<&str> = shipped
         .watches

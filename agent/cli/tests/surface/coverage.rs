@@ -6,7 +6,7 @@ use std::fmt::Write as _;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-const MARK: &str = "// Coverage: ";
+const COVERAGE_MARK: &str = "// Coverage: ";
 const VERDICTS: [&str; 3] = ["exact", "counted", "named"];
 const BEGIN: &str = "<!-- coverage: generated from the tests -->\n";
 const END: &str = "<!-- coverage: end";
@@ -38,7 +38,7 @@ fn rows(root: &Path) -> BTreeMap<[String; 4], Vec<String>> {
         let mut marked = Vec::new();
         let mut is_test = false;
         for line in text.lines() {
-            if let Some(row) = line.strip_prefix(MARK) {
+            if let Some(row) = line.strip_prefix(COVERAGE_MARK) {
                 let cells: Vec<String> = row.split(" | ").map(str::to_owned).collect();
                 let cells = <[String; 4]>::try_from(cells).unwrap();
                 assert!(VERDICTS.contains(&&*cells[3]), "{}: {row}", path.display());

@@ -197,15 +197,15 @@ fn grafana_s_types_accept_the_dashboards_and_reject_mistakes() -> Result<()> {
         ensure!(text.contains(right), "{right} is nowhere");
         files.push((format!("wrong{number}"), text.replacen(right, wrong, 1)));
     }
-    let said = type_check(&files)?;
+    let printed = type_check(&files)?;
     for (name, _) in &files {
-        let complaint = said
+        let complaint = printed
             .lines()
             .find(|line| line.starts_with(&format!("{name}.ts(")));
         let wrong = name.starts_with("wrong");
         ensure!(
             complaint.is_some() == wrong,
-            "{name}: {complaint:?}\n{said}"
+            "{name}: {complaint:?}\n{printed}"
         );
     }
     Ok(())

@@ -8,7 +8,7 @@ use std::path::Path;
 use proptest::prelude::*;
 use ros2probe::discover::Refusal;
 use ros2probe::discover::message::{LocalParticipant, Message};
-use ros2probe::discover::session::{MOST_PACKETS, Outgoing, Session, Target};
+use ros2probe::discover::session::{MAX_PACKETS, Outgoing, Session, Target};
 use ros2probe_model::facts::bounded::ledger;
 use ros2probe_model::facts::model_time::ModelTime;
 use ros2probe_model::graph::discovery::{Addresses, hexadecimal};
@@ -111,9 +111,13 @@ impl Recording {
 }
 
 /// Checks the rules of every conversation.
-fn assert_is_polite(session: &Session, recording: &Recording, outgoing: &[(u64, Outgoing)]) {
+fn assert_conversation_rules(
+    session: &Session,
+    recording: &Recording,
+    outgoing: &[(u64, Outgoing)],
+) {
     let (sent, _) = session.cost();
-    assert!(sent.packets <= MOST_PACKETS, "{} packets", sent.packets);
+    assert!(sent.packets <= MAX_PACKETS, "{} packets", sent.packets);
     assert_eq!(sent.packets as usize, outgoing.len());
     let bytes: usize = outgoing.iter().map(|(_, packet)| packet.bytes.len()).sum();
     assert_eq!(sent.bytes, bytes as u64);
@@ -149,7 +153,7 @@ fn real_participants_get_the_recorded_packets_and_announce_all_endpoints() {
         let sent: Vec<_> = outgoing.iter().map(|(_, packet)| &packet.bytes).collect();
         let recorded: Vec<_> = recording.sent.iter().map(|(_, bytes)| bytes).collect();
         assert_eq!(sent, recorded);
-        assert_is_polite(&session, &recording, &outgoing);
+        assert_conversation_rules(&session, &recording, &outgoing);
         let expected = (0..24).map(|n| format!("/robot/sensors/camera_{n}"));
         assert_eq!(names(&session), expected.collect());
         let writers = session
@@ -170,7 +174,7 @@ fn without_nodes_one_packet_less_is_sent_and_no_reader_is_announced() {
     for recording in Recording::both() {
         let mut session = Session::new(recording.speaker, recording.target, false);
         let outgoing = recording.play(&mut session, &recording.received);
-        assert_is_polite(&session, &recording, &outgoing);
+        assert_conversation_rules(&session, &recording, &outgoing);
         assert_eq!((outgoing.len(), session.endpoints().len()), (3, 26));
         assert!(session.nodes().is_none() && !session.expects_nodes());
         let reader = |(_, packet): &(u64, Outgoing)| {
@@ -188,9 +192,9 @@ fn silence_leads_to_one_more_introduction_and_a_goodbye() {
     let [recording, _] = Recording::both();
     let mut session = recording.session();
     let outgoing = recording.play(&mut session, &[]);
-    assert_is_polite(&session, &recording, &outgoing);
-    let said: Vec<_> = outgoing.iter().map(|(_, packet)| packet.what).collect();
-    assert_eq!(said, ["introduction", "introduction", "goodbye"]);
+    assert_conversation_rules(&session, &recording, &outgoing);
+    let printed: Vec<_> = outgoing.iter().map(|(_, packet)| packet.what).collect();
+    assert_eq!(printed, ["introduction", "introduction", "goodbye"]);
     let (last, _) = outgoing.last().unwrap();
     assert!(*last <= 1_010 * MILLISECOND);
     assert!(!session.was_answered());
@@ -219,7 +223,7 @@ fn a_participant_with_endless_announcements_gets_no_more_packets() {
             .collect();
         let mut session = recording.session();
         let outgoing = recording.play(&mut session, &answers);
-        assert_is_polite(&session, &recording, &outgoing);
+        assert_conversation_rules(&session, &recording, &outgoing);
         assert!(session.missing() > 0 && session.missing() <= 2 * 4096);
     }
 }
@@ -327,12 +331,12 @@ fn participants_with_dds_security_or_without_an_address_are_not_contacted() {
         announces_by_tcp: true,
         ..participant(false, &[])
     };
-    assert_eq!(Target::of(&by_tcp), Err(Refusal::ByTcp));
+    assert_eq!(Target::of(&by_tcp), Err(Refusal::UsesTcp));
     let found = asked(false, &["[::1]:9", there]).unwrap();
     assert_eq!(found, (there.to_owned(), "127.0.0.1:7411".to_owned()));
     let mut asking = participant(false, &[there]);
     asking.guid.prefix = GuidPrefix(*b"\x01\x7fabcdefghij");
-    assert_eq!(Target::of(&asking), Err(Refusal::Asking));
+    assert_eq!(Target::of(&asking), Err(Refusal::OtherDiscover));
 }
 
 proptest! {
@@ -361,6 +365,6 @@ proptest! {
         }
         let mut session = recording.session();
         let outgoing = recording.play(&mut session, &answers);
-        assert_is_polite(&session, recording, &outgoing);
+        assert_conversation_rules(&session, recording, &outgoing);
     }
 }

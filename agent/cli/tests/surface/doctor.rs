@@ -12,11 +12,11 @@ use ros2probe_testing::local_agent::{self, LocalAgent, PATIENCE};
 use serde_json::Value;
 
 /// A socket that does not exist.
-const NOWHERE: &str = "/nonexistent/api.sock";
+const UNUSED_ADDRESS: &str = "/nonexistent/api.sock";
 
 fn report(output: &Output) -> Value {
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(said, "");
+    let printed = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(printed, "");
     let report: Value = serde_json::from_slice(&output.stdout).unwrap();
     // The exit code agrees with the report.
     let is_problem = report["verdict"] == "problem";
@@ -43,7 +43,7 @@ fn is_root() -> bool {
 #[test]
 fn without_an_agent_doctor_examines_the_host_and_tries_permitted_sources() {
     let output = rp()
-        .args(["doctor", "--json", "--socket", NOWHERE])
+        .args(["doctor", "--json", "--socket", UNUSED_ADDRESS])
         .env("ROS_DISTRO", "jazzy")
         .env("ROS_DOMAIN_ID", "150")
         .env("SECRET", "hunter2")
@@ -80,7 +80,7 @@ fn an_unprivileged_user_sees_which_checks_need_root() {
         command
             .args(["--inh-caps=-all"])
             .arg(&program)
-            .args(["doctor", "--socket", NOWHERE])
+            .args(["doctor", "--socket", UNUSED_ADDRESS])
             .args(arguments)
             .env_remove("NO_COLOR")
             .output()
@@ -169,14 +169,14 @@ fn a_missing_agent_or_configuration_is_reported_in_one_line() {
         &["--config", "/nowhere.yaml"],
     ] {
         let output = rp().arg("doctor").args(arguments).output().unwrap();
-        let said = String::from_utf8(output.stderr).unwrap();
+        let printed = String::from_utf8(output.stderr).unwrap();
         assert!(!output.status.success());
-        assert_eq!(said.lines().count(), 1, "{said}");
+        assert_eq!(printed.lines().count(), 1, "{printed}");
         assert!(output.stdout.is_empty());
     }
     let wrong = Path::new(env!("CARGO_MANIFEST_DIR")).join("Cargo.toml");
     let output = rp()
-        .args(["doctor", "--json", "--socket", NOWHERE, "--config"])
+        .args(["doctor", "--json", "--socket", UNUSED_ADDRESS, "--config"])
         .arg(wrong)
         .output()
         .unwrap();

@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 
 use crate::rp;
 use ros2probe_testing::local_agent::{
-    Answer, LocalAgent, PATIENCE, ask, exchange, promtool, request,
+    Answer, LocalAgent, PATIENCE, call_api, exchange, promtool, request,
 };
 use seccompiler::{BpfProgram, SeccompAction, SeccompFilter};
 use serde_json::Value;
@@ -43,7 +43,7 @@ fn bytes_of(address: SocketAddr, path: &str, headers: &str) -> (String, Vec<u8>)
 fn unfinished_requests_with_long_heads_take_little_memory_and_block_no_client() {
     let mut agent = LocalAgent::start(&mut rp(), &["--speed", "max"]);
     agent.wait_for_log("ready");
-    assert_eq!(ask(agent.api, "GET", "/health", "").0, 200);
+    assert_eq!(call_api(agent.api, "GET", "/health", "").0, 200);
     let before = kibibytes(&agent, "RssAnon");
     let mut most = 0;
     let mut clients = Vec::new();
@@ -72,7 +72,7 @@ fn unfinished_requests_with_long_heads_take_little_memory_and_block_no_client() 
         .saturating_sub(before);
     eprintln!("160 unfinished requests of up to 380 KB: {grown} KiB");
     assert!(grown < 3 << 10, "{grown} KiB");
-    assert_eq!(ask(agent.api, "GET", "/health", "").0, 200);
+    assert_eq!(call_api(agent.api, "GET", "/health", "").0, 200);
     assert_eq!(agent.get("/metrics").status, 200);
     drop(clients);
 }
@@ -197,7 +197,7 @@ fn missing_system_call_filters_are_reported_everywhere() {
         .find(|line| line.starts_with("ros2probe_sandbox_info{"));
     let shown = shown.unwrap_or_default();
     assert!(shown.contains("system_calls=\"all\""), "{shown}");
-    let health = ask(agent.api, "GET", "/health", "").1;
+    let health = call_api(agent.api, "GET", "/health", "").1;
     assert!(health["unfiltered_reason"].is_string(), "{health}");
 }
 
@@ -363,12 +363,12 @@ fn by_default_loopback_grants_watches_but_no_payloads() {
         ])
         .output()
         .unwrap();
-    let said = String::from_utf8(echo.stderr).unwrap();
+    let printed = String::from_utf8(echo.stderr).unwrap();
     assert!(!echo.status.success());
-    assert_eq!(said.lines().count(), 1, "{said}");
+    assert_eq!(printed.lines().count(), 1, "{printed}");
     assert!(
-        said.contains("loopback grants no message payloads"),
-        "{said}"
+        printed.contains("loopback grants no message payloads"),
+        "{printed}"
     );
 }
 
@@ -400,9 +400,12 @@ fn a_client_of_a_silent_server_gives_up_after_five_seconds() {
         server.write_all(beginning.as_bytes()).unwrap();
         let output = child.wait_with_output().unwrap();
         let seconds = began.elapsed().as_secs_f64();
-        let said = String::from_utf8(output.stderr).unwrap();
+        let printed = String::from_utf8(output.stderr).unwrap();
         assert!(!output.status.success());
-        assert!(said.contains("does not answer"), "{command:?}: {said}");
+        assert!(
+            printed.contains("does not answer"),
+            "{command:?}: {printed}"
+        );
         assert!((4.5..9.0).contains(&seconds), "{command:?}: {seconds} s");
         drop(server);
     }
@@ -418,17 +421,17 @@ fn text_of_a_file_is_escaped_before_it_reaches_the_terminal() {
     };
     let run = |arguments: &[&str], path: &Path| {
         let output = rp().args(arguments).arg(path).output().unwrap();
-        let said = [output.stdout, output.stderr].concat();
-        assert!(!steers(&said), "{arguments:?}: {said:?}");
-        String::from_utf8(said).unwrap()
+        let printed = [output.stdout, output.stderr].concat();
+        assert!(!steers(&printed), "{arguments:?}: {printed:?}");
+        String::from_utf8(printed).unwrap()
     };
 
     let config = directory.path().join("config.yaml");
     let hostile = "\\e]0;title\\a\\u200b";
     let text = format!("\"{hostile}\": 1\nwatch: [\"/a{hostile}\"]\nlog: \"{hostile}\"\n");
     std::fs::write(&config, text).unwrap();
-    let said = run(&["check-config"], &config);
-    assert!(said.contains("]0;title"), "{said}");
+    let printed = run(&["check-config"], &config);
+    assert!(printed.contains("]0;title"), "{printed}");
 
     let bag = directory.path().join("bag");
     std::fs::create_dir(&bag).unwrap();
@@ -442,10 +445,10 @@ fn text_of_a_file_is_escaped_before_it_reaches_the_terminal() {
          custom_data: {{}}\n  ros_distro: \"jazzy{hostile}\"\n"
     );
     std::fs::write(bag.join("metadata.yaml"), metadata).unwrap();
-    let said = run(&["bag", "info"], &bag);
+    let printed = run(&["bag", "info"], &bag);
     assert!(
-        said.contains("/a\\u{1b}]0;title\\u{7}\\u{200b} | Type"),
-        "{said}"
+        printed.contains("/a\\u{1b}]0;title\\u{7}\\u{200b} | Type"),
+        "{printed}"
     );
     run(&["bag", "info", "--topic-name"], &bag);
     run(&["bag", "info", "--verbose"], &bag);
@@ -454,6 +457,6 @@ fn text_of_a_file_is_escaped_before_it_reaches_the_terminal() {
     std::fs::create_dir(&cut).unwrap();
     let name = "a\u{1b}]0;title\u{7}\u{200b}.mcap";
     std::fs::write(cut.join(name), "nothing").unwrap();
-    let said = run(&["bag", "reindex"], &cut);
-    assert!(said.contains("]0;title"), "{said}");
+    let printed = run(&["bag", "reindex"], &cut);
+    assert!(printed.contains("]0;title"), "{printed}");
 }

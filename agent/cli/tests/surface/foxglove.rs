@@ -13,10 +13,10 @@ use crate::rp;
 use crate::samples::replayed;
 use ros2probe_model::facts::dispatch::SampleOutcome;
 use ros2probe_model::facts::selection::Depth;
-use ros2probe_testing::local_agent::{self, LocalAgent, ask, metric};
+use ros2probe_testing::local_agent::{self, LocalAgent, call_api, metric};
 use ros2probe_testing::repository;
 use ros2probe_testing::viewer::{
-    Data, News, PATIENCE, Refused, SUBPROTOCOLS, Status, Viewer, open,
+    Data, PATIENCE, Refused, SUBPROTOCOLS, ServerMessage, Status, Viewer, open,
 };
 use serde_json::{Value, json};
 use tokio_tungstenite::tungstenite::Message;
@@ -92,7 +92,7 @@ fn a_viewer_gets_the_messages_of_a_capture_as_they_were_sent() {
     loop {
         assert!(Instant::now() < deadline, "the capture does not end");
         match viewer.next_within(PATIENCE).unwrap().expect("no news") {
-            News::Channels => {
+            ServerMessage::Channels => {
                 let subscribed: BTreeSet<_> = viewer.subscriptions.values().copied().collect();
                 let new: Vec<_> = viewer.channels.keys().copied().collect();
                 let new: Vec<_> = new
@@ -104,7 +104,7 @@ fn a_viewer_gets_the_messages_of_a_capture_as_they_were_sent() {
                     names.insert(id, viewer.channels[&channel].topic.clone());
                 }
             }
-            News::Data(Data {
+            ServerMessage::Data(Data {
                 subscription,
                 time,
                 payload,
@@ -123,15 +123,15 @@ fn a_viewer_gets_the_messages_of_a_capture_as_they_were_sent() {
                         .push((time, payload));
                 }
             }
-            News::Time(time) => {
+            ServerMessage::Time(time) => {
                 assert!(time >= clock, "{time} after {clock}");
                 clock = time;
             }
-            News::Status(status) if status.id == "end" => break,
+            ServerMessage::Status(status) if status.id == "end" => break,
             // Topics such as `/rosout` have no subscriber.
-            News::Status(status) if status.id == "no_subscriber" => {}
-            News::Graph => is_published |= viewer.graph.published.contains_key("/chatter"),
-            news => panic!("{news:?}"),
+            ServerMessage::Status(status) if status.id == "no_subscriber" => {}
+            ServerMessage::Graph => is_published |= viewer.graph.published.contains_key("/chatter"),
+            server_message => panic!("{server_message:?}"),
         }
     }
     assert!(
@@ -197,7 +197,7 @@ for name, text in json.loads(sys.argv[1]):
 
 /// The figures agree with those of the API, and each matches its schema.
 fn check_figures(agent: &LocalAgent, figures: &BTreeMap<String, Value>, viewer: &Viewer) {
-    let (_, topic) = ask(agent.api, "GET", "/topics/chatter", "");
+    let (_, topic) = call_api(agent.api, "GET", "/topics/chatter", "");
     let chatter = &figures["/chatter"];
     let measured = &topic["measurement"];
     assert!(
@@ -285,7 +285,7 @@ fn foreign_pages_need_a_token_but_pages_of_viewers_and_of_this_host_do_not() {
     for host in ["evil.example:8765", "localhost.evil.example"] {
         assert_eq!(with("host", host).err().unwrap().status, 403, "{host}");
     }
-    let (status, token) = ask(agent.api, "POST", "/page/token", "{}");
+    let (status, token) = call_api(agent.api, "POST", "/page/token", "{}");
     assert_eq!(status, 200);
     let path = format!("/?token={}", token["token"].as_str().unwrap());
     let elsewhere = [("origin", "https://lichtblick.example")];
@@ -330,8 +330,8 @@ fn without_a_token_a_viewer_has_the_rights_of_loopback() {
         .wait_for_topics(&["/chatter", "/rp/topics/chatter"])
         .unwrap();
     viewer.subscribe("/chatter").unwrap();
-    let status = viewer.wait_for("a status", |_, news| match news {
-        News::Status(status) => Some(status.clone()),
+    let status = viewer.wait_for("a status", |_, server_message| match server_message {
+        ServerMessage::Status(status) => Some(status.clone()),
         _ => None,
     });
     let Status { level, message, .. } = status.unwrap();
@@ -339,12 +339,12 @@ fn without_a_token_a_viewer_has_the_rights_of_loopback() {
     assert!(message.contains("rp foxglove"), "{message}");
     wait_for_viewers(&agent, 1.0, 0.0);
     let id = viewer.subscribe("/rp/topics/chatter").unwrap();
-    let is_figure = |_: &Viewer, news: &News| match news {
-        News::Data(data) => (data.subscription == id).then_some(()),
+    let is_figure = |_: &Viewer, server_message: &ServerMessage| match server_message {
+        ServerMessage::Data(data) => (data.subscription == id).then_some(()),
         _ => None,
     };
     viewer.wait_for("figures", is_figure).unwrap();
-    let (_, health) = ask(agent.api, "GET", "/health", "");
+    let (_, health) = call_api(agent.api, "GET", "/health", "");
     let listener = &health["foxglove"];
     let url = format!("ws://localhost:{}/", address.port());
     assert_eq!(
@@ -452,8 +452,8 @@ fn clients_that_violate_the_protocol_are_closed_with_a_code_and_use_no_resources
         viewer
             .send(&json!({"op": "subscribe", "subscriptions": entries}))
             .unwrap();
-        let status = viewer.wait_for("a status", |_, news| match news {
-            News::Status(status) => Some(status.clone()),
+        let status = viewer.wait_for("a status", |_, server_message| match server_message {
+            ServerMessage::Status(status) => Some(status.clone()),
             _ => None,
         });
         assert!(
@@ -470,8 +470,8 @@ fn clients_that_violate_the_protocol_are_closed_with_a_code_and_use_no_resources
         .send(&json!({"op": "advertise", "channels": []}))
         .unwrap();
     for what in ["binary messages", "`advertise`"] {
-        let status = viewer.wait_for("a status", |_, news| match news {
-            News::Status(status) => Some(status.clone()),
+        let status = viewer.wait_for("a status", |_, server_message| match server_message {
+            ServerMessage::Status(status) => Some(status.clone()),
             _ => None,
         });
         let message = status.unwrap().message;
@@ -507,7 +507,7 @@ fn a_busy_port_leads_to_one_warning_and_the_agent_continues() {
         warnings[0].contains("foxglove.listen") && warnings[0].contains(&address),
         "{log}"
     );
-    let (_, health) = ask(agent.api, "GET", "/health", "");
+    let (_, health) = call_api(agent.api, "GET", "/health", "");
     assert!(
         health["foxglove"]["reason"]
             .as_str()

@@ -256,7 +256,7 @@ fn without_the_source_the_command_prints_how_to_enable_it() {
 }
 
 #[test]
-fn without_the_source_no_call_is_late_and_the_command_says_why() {
+fn without_the_source_no_call_is_late_and_the_command_prints_the_reason() {
     let capture = local_agent::capture();
     let run = |arguments: &[&str]| {
         let mut command = rp();

@@ -19,7 +19,7 @@ const ALICE: GuidPrefix = GuidPrefix(*b"\x01\x10learn.alic");
 const BOB: GuidPrefix = GuidPrefix(*b"\x01\x10learn.bobb");
 const START: u64 = 1_800_000_000 * SECOND;
 const SECOND: u64 = 1_000_000_000;
-const LASTS: u64 = 60;
+const CAPTURE_SECONDS: u64 = 60;
 
 /// Topics and their periods in milliseconds.
 const TOPICS: [(&str, u64); 6] = [
@@ -90,7 +90,7 @@ fn topic(
         Box::new(move |capture| capture.reader(at, 0, to, name, announcement)),
     ));
     let mut sequence_number = 0;
-    for count in 0..LASTS * 1000 / period {
+    for count in 0..CAPTURE_SECONDS * 1000 / period {
         let since = SECOND / 2 + count * period * 1_000_000;
         let is_sent = match fault {
             Some(Fault::HalfRate) => count % 2 == 0,
@@ -129,9 +129,12 @@ fn learn(capture: &Path) -> PathBuf {
     let words = ["learn", "--replay", capture.to_str().unwrap(), "-o"];
     let output = run(&[&words[..], &[file.to_str().unwrap()]].concat());
     assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
-    let said = stderr(&output);
-    assert_eq!(said.lines().count(), 1, "{said}");
-    assert!(said.starts_with("rp: expectations for "), "{said}");
+    let output_text = stderr(&output);
+    assert_eq!(output_text.lines().count(), 1, "{output_text}");
+    assert!(
+        output_text.starts_with("rp: expectations for "),
+        "{output_text}"
+    );
     file
 }
 
@@ -160,7 +163,7 @@ fn violations(capture: &Path, configuration: &Path) -> BTreeMap<String, BTreeSet
 }
 
 #[test]
-fn a_healthy_robot_meets_its_learnt_expectations_and_each_fault_violates_its_topic() {
+fn a_healthy_robot_violates_no_learnt_expectation_and_each_fault_violates_one() {
     let directory = tempfile::tempdir().unwrap();
     let healthy = directory.path().join("healthy.pcap");
     robot(&healthy, &[]);
@@ -206,7 +209,7 @@ fn a_healthy_robot_meets_its_learnt_expectations_and_each_fault_violates_its_top
 }
 
 #[test]
-fn real_robots_meet_their_learnt_expectations() {
+fn real_robots_violate_no_expectation_learnt_from_them() {
     let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../testing/data");
     let directory = tempfile::tempdir().unwrap();
     for capture in [
@@ -292,9 +295,12 @@ fn a_file_is_replaced_only_with_force_and_a_failure_leaves_no_file() {
         let other = directory.path().join("other.yaml");
         let output = other.to_str().unwrap();
         let failed = run(&[&words[..], &["--replay", capture, "-o", output]].concat());
-        let said = stderr(&failed);
-        assert_eq!(failed.status.code(), Some(1), "{said}");
-        assert!(said.contains(part), "`{part}` is not in {said}");
+        let output_text = stderr(&failed);
+        assert_eq!(failed.status.code(), Some(1), "{output_text}");
+        assert!(
+            output_text.contains(part),
+            "`{part}` is not in {output_text}"
+        );
         assert!(!other.exists());
     }
     let missing = directory.path().join("no/such/directory.yaml");
@@ -338,7 +344,7 @@ fn the_progress_takes_one_line_of_a_terminal() {
 }
 
 #[test]
-fn an_end_time_limits_what_is_learnt_from_a_capture_and_wrong_minutes_are_refused() {
+fn rp_learn_reads_a_capture_up_to_the_end_time_and_refuses_invalid_minutes() {
     let directory = tempfile::tempdir().unwrap();
     let capture = directory.path().join("robot.pcap");
     robot(&capture, &[]);

@@ -24,7 +24,7 @@ use ros2probe_daemon::surface::MetricSources;
 use ros2probe_model::facts::dispatch::{Dispatch, Sample, SampleOutcome};
 use ros2probe_model::observe::observer::Settings;
 use ros2probe_model::report::snapshot::Snapshot;
-use ros2probe_testing::local_agent::{self, LocalAgent, PATIENCE, ask, metric};
+use ros2probe_testing::local_agent::{self, LocalAgent, PATIENCE, call_api, metric};
 use ros2probe_testing::model::domain::VirtualDomain;
 use ros2probe_testing::model::forge::{Message, SEDP_WRITERS, SPDP};
 use ros2probe_testing::model::host::{BOB, CapturePoint, Host};
@@ -36,7 +36,7 @@ use tokio_util::sync::CancellationToken;
 const LEASE: u32 = 10_000;
 
 /// Returns how much of a cap is used, and how often the cap was reached.
-fn standing(limits: Limits, snapshot: Snapshot, limit: Limit) -> (u64, u64) {
+fn limit_usage(limits: Limits, snapshot: Snapshot, limit: Limit) -> (u64, u64) {
     let settings = ros2probe_daemon::settings_cell::Settings {
         limits,
         ..ros2probe_daemon::settings_cell::Settings::default()
@@ -85,7 +85,7 @@ impl World {
     }
 
     fn standing(&self, limit: Limit) -> (u64, u64) {
-        standing(self.limits, self.snapshot(), limit)
+        limit_usage(self.limits, self.snapshot(), limit)
     }
 }
 
@@ -219,7 +219,7 @@ fn flows_beyond_the_cap_are_not_followed_until_others_are_silent() {
     for number in 1..=10 {
         (1..=3).for_each(|port| host.data(at(port), number));
     }
-    assert_eq!(standing(limits, host.snapshot(), Limit::Flows), (2, 10));
+    assert_eq!(limit_usage(limits, host.snapshot(), Limit::Flows), (2, 10));
     assert!(
         host.deliveries()
             .iter()
@@ -236,11 +236,11 @@ fn flows_beyond_the_cap_are_not_followed_until_others_are_silent() {
         .map(|each| each.destination.port())
         .collect();
     assert_eq!(ports, [2, 3]);
-    let (used, reached) = standing(limits, host.snapshot(), Limit::Flows);
+    let (used, reached) = limit_usage(limits, host.snapshot(), Limit::Flows);
     host.data(at(3), 61);
     assert_eq!(used, 2);
     assert_eq!(
-        standing(limits, host.snapshot(), Limit::Flows),
+        limit_usage(limits, host.snapshot(), Limit::Flows),
         (2, reached)
     );
 }
@@ -353,8 +353,8 @@ fn wait_for(agent: &LocalAgent, limit: &str, used: f64, reached: f64) {
 fn watches_beyond_the_cap_are_refused_for_clients_and_for_a_reload() {
     let directory = tempfile::tempdir().unwrap();
     let mut agent = agent(directory.path(), "watches: 3");
-    assert_eq!(ask(agent.api, "POST", "/watch/c", "").0, 201);
-    let (status, problem) = ask(agent.api, "POST", "/watch/d", "");
+    assert_eq!(call_api(agent.api, "POST", "/watch/c", "").0, 201);
+    let (status, problem) = call_api(agent.api, "POST", "/watch/d", "");
     assert_eq!(status, 409, "{problem}");
     assert_eq!(problem["type"], "urn:ros2probe:problem:too-many-watches");
     let detail = problem["detail"].as_str().unwrap();
@@ -362,8 +362,8 @@ fn watches_beyond_the_cap_are_refused_for_clients_and_for_a_reload() {
     wait_for(&agent, "watches", 3.0, 1.0);
     // Existing watches can be changed.
     let changed = r#"{"max_silence_s": 5}"#;
-    assert_eq!(ask(agent.api, "PUT", "/watch/c", changed).0, 200);
-    assert_eq!(ask(agent.api, "POST", "/watch/a", "").0, 200);
+    assert_eq!(call_api(agent.api, "PUT", "/watch/c", changed).0, 200);
+    assert_eq!(call_api(agent.api, "POST", "/watch/a", "").0, 200);
 
     let file = directory.path().join("ros2probe.yaml");
     let text = std::fs::read_to_string(&file).unwrap();
@@ -372,9 +372,9 @@ fn watches_beyond_the_cap_are_refused_for_clients_and_for_a_reload() {
     let line = agent.wait_for_log("the configuration was not reloaded");
     assert!(line.contains("limits.watches"), "{line}");
     wait_for(&agent, "watches", 3.0, 2.0);
-    assert_eq!(ask(agent.api, "GET", "/watch/e", "").0, 404);
-    assert_eq!(ask(agent.api, "DELETE", "/watch/c", "").0, 204);
-    assert_eq!(ask(agent.api, "POST", "/watch/d", "").0, 201);
+    assert_eq!(call_api(agent.api, "GET", "/watch/e", "").0, 404);
+    assert_eq!(call_api(agent.api, "DELETE", "/watch/c", "").0, 204);
+    assert_eq!(call_api(agent.api, "POST", "/watch/d", "").0, 201);
     wait_for(&agent, "watches", 3.0, 2.0);
 }
 
@@ -383,22 +383,22 @@ fn recordings_beyond_the_cap_are_refused_until_one_ends() {
     let directory = tempfile::tempdir().unwrap();
     let agent = agent(directory.path(), "recordings: 1");
     assert_eq!(
-        ask(agent.api, "POST", "/recordings", r#"{"name": "one"}"#).0,
+        call_api(agent.api, "POST", "/recordings", r#"{"name": "one"}"#).0,
         201
     );
-    let (status, problem) = ask(agent.api, "POST", "/recordings", r#"{"name": "two"}"#);
+    let (status, problem) = call_api(agent.api, "POST", "/recordings", r#"{"name": "two"}"#);
     assert_eq!(status, 409, "{problem}");
     assert_eq!(problem["type"], "urn:ros2probe:problem:too-many-recordings");
     assert!(!directory.path().join("bags/two").exists());
     wait_for(&agent, "recordings", 1.0, 1.0);
     assert_eq!(
-        ask(agent.api, "GET", "/recordings/one", "").1["state"],
+        call_api(agent.api, "GET", "/recordings/one", "").1["state"],
         "recording"
     );
-    assert_eq!(ask(agent.api, "DELETE", "/recordings/one", "").0, 200);
+    assert_eq!(call_api(agent.api, "DELETE", "/recordings/one", "").0, 200);
     wait_for(&agent, "recordings", 0.0, 1.0);
     assert_eq!(
-        ask(agent.api, "POST", "/recordings", r#"{"name": "two"}"#).0,
+        call_api(agent.api, "POST", "/recordings", r#"{"name": "two"}"#).0,
         201
     );
 }
@@ -486,7 +486,7 @@ fn viewers_beyond_the_cap_are_refused_until_one_leaves() {
 }
 
 /// Returns a capture of this number of UDP datagrams, with only the first IP fragment of each.
-fn torn(count: u16) -> Vec<u8> {
+fn incomplete_datagrams(count: u16) -> Vec<u8> {
     let mut capture = Vec::new();
     capture.extend_from_slice(&0xa1b2_c3d4_u32.to_le_bytes());
     capture.extend_from_slice(&[2, 0, 4, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 4, 0, 1, 0, 0, 0]);
@@ -517,7 +517,7 @@ fn torn(count: u16) -> Vec<u8> {
 fn fragments_beyond_the_cap_in_bytes_evict_the_oldest() {
     let directory = tempfile::tempdir().unwrap();
     let capture = directory.path().join("torn.pcap");
-    std::fs::write(&capture, torn(100)).unwrap();
+    std::fs::write(&capture, incomplete_datagrams(100)).unwrap();
     let limits = "reassembly_bytes: 65536";
     let mut agent = agent_on(&capture, directory.path(), "max", limits);
     agent.wait_for_log("ready");
@@ -544,7 +544,7 @@ fn a_reached_limit_is_reported_by_readyz_metrics_health_and_rp_doctor() {
     let degraded = answer.body.strip_prefix("ready\ndegraded: ").unwrap();
     let reason = "at a limit: participants (1 of 1, ";
     assert!(degraded.starts_with(reason), "{degraded}");
-    let (_, health) = ask(agent.api, "GET", "/health", "");
+    let (_, health) = call_api(agent.api, "GET", "/health", "");
     assert_eq!(health["ready"], true);
     assert_eq!(health["degraded"], degraded.trim_end());
     assert_eq!(health["limits"][0]["at_limit"], true, "{health:#}");
@@ -594,7 +594,7 @@ fn a_configuration_for_a_newer_rp_is_refused_with_one_line() {
     agent.signal("-HUP");
     let line = agent.wait_for_log("the configuration was not reloaded");
     assert!(line.contains("version: is 2"), "{line}");
-    assert_eq!(ask(agent.api, "GET", "/watch/a", "").0, 200);
+    assert_eq!(call_api(agent.api, "GET", "/watch/a", "").0, 200);
     // The same configuration with a version, and without one.
     for same in [format!("version: 1\n{before}"), before] {
         std::fs::write(&file, same).unwrap();

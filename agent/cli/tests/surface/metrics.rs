@@ -543,7 +543,7 @@ fn a_watched_topic_without_endpoints_begins_at_zero() {
 }
 
 #[test]
-fn measured_topics_come_first_when_the_cap_is_reached() {
+fn measured_topics_have_priority_at_the_cap() {
     let mut snapshot = sample_robot::snapshot(["/z_measured"]);
     snapshot.watches.clear();
     for index in 0..2_000 {

@@ -295,7 +295,7 @@ fn the_log_of_the_agent_is_exported_if_enabled_and_exports_add_no_lines_to_it() 
 }
 
 #[test]
-fn logs_of_nodes_are_exported_from_a_level_on_with_place_and_trace() {
+fn logs_of_nodes_are_exported_from_a_level_on_with_location_and_trace() {
     let directory = tempfile::tempdir().unwrap();
     let prefix = GuidPrefix([3; 12]);
     let writer = Guid::new(prefix, EntityId([0, 0, 1, 3]));

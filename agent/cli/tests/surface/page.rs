@@ -14,7 +14,7 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use crate::rp;
-use ros2probe_testing::local_agent::{Answer, LocalAgent, PATIENCE, ask, exchange, request};
+use ros2probe_testing::local_agent::{Answer, LocalAgent, PATIENCE, call_api, exchange, request};
 use serde_json::{Value, json};
 
 /// Returns the path of a capture of `agent/testing/data`.
@@ -33,7 +33,7 @@ fn ended(name: &str, arguments: &[&str]) -> LocalAgent {
 }
 
 pub(crate) fn get(agent: &LocalAgent, path: &str) -> Value {
-    let (status, body) = ask(agent.api, "GET", path, "");
+    let (status, body) = call_api(agent.api, "GET", path, "");
     assert_eq!(status, 200, "{path}: {body}");
     body
 }
@@ -244,7 +244,7 @@ fn the_page_can_be_switched_off() {
         );
     }
     assert_eq!(get(&agent, "/health")["ready"], true);
-    let (status, token) = ask(agent.api, "POST", "/page/token", "");
+    let (status, token) = call_api(agent.api, "POST", "/page/token", "");
     assert_eq!((status, &token["address"]), (200, &Value::Null));
 }
 
@@ -277,9 +277,9 @@ fn a_token_from_the_socket_grants_the_page_more_access_than_loopback() {
         .arg(&socket)
         .output()
         .unwrap();
-    let said = String::from_utf8(printed.stderr).unwrap();
+    let output_text = String::from_utf8(printed.stderr).unwrap();
     let address = String::from_utf8(printed.stdout).unwrap();
-    assert!(printed.status.success(), "{said}");
+    assert!(printed.status.success(), "{output_text}");
     let (page, token) = address.trim().split_once("#token=").unwrap();
     assert_eq!(page, format!("http://localhost:{}/", agent.api.port()));
     let bearer = format!("Authorization: Bearer {token}\r\n");

@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 
 use crate::rp;
 use ros2probe_testing::bag_messages::for_each_message;
-use ros2probe_testing::local_agent::{self, LocalAgent, PATIENCE, ask};
+use ros2probe_testing::local_agent::{self, LocalAgent, PATIENCE, call_api};
 use ros2probe_testing::model::capture::{Capture, ETHERNET, reader, writer};
 use ros2probe_wire::GuidPrefix;
 use ros2probe_wire::time::SECOND;
@@ -57,7 +57,7 @@ fn agent_on(capture: &Path, directory: &Path, speed: &str, more: &str) -> LocalA
 fn wait_for(api: SocketAddr, name: &str, wanted: impl Fn(&Value) -> bool) -> Value {
     let deadline = Instant::now() + PATIENCE;
     loop {
-        let (status, recording) = ask(api, "GET", &format!("/recordings/{name}"), "");
+        let (status, recording) = call_api(api, "GET", &format!("/recordings/{name}"), "");
         if status == 200 && wanted(&recording) {
             return recording;
         }
@@ -84,20 +84,20 @@ fn a_headless_robot_records_on_request_and_lists_its_recordings() {
     let agent = agent(directory.path(), "");
     let api = agent.api;
 
-    let (status, begun) = ask(api, "POST", "/recordings", r#"{"name": "drive"}"#);
+    let (status, begun) = call_api(api, "POST", "/recordings", r#"{"name": "drive"}"#);
     assert_eq!(
         (status, &begun["name"]),
         (201, &Value::from("drive")),
         "{begun}"
     );
     assert_eq!(begun["topics"]["all_topics"], true);
-    let (status, again) = ask(api, "POST", "/recordings", r#"{"name": "drive"}"#);
+    let (status, again) = call_api(api, "POST", "/recordings", r#"{"name": "drive"}"#);
     assert_eq!(status, 409, "{again}");
     let of = |recording: &Value, key: &str| recording["report"][key].as_u64().unwrap();
     wait_for(api, "drive", |recording| of(recording, "messages") > 5);
 
-    assert_eq!(ask(api, "POST", "/recordings/drive/split", "").0, 202);
-    assert_eq!(ask(api, "POST", "/recordings/drive/pause", "").0, 202);
+    assert_eq!(call_api(api, "POST", "/recordings/drive/split", "").0, 202);
+    assert_eq!(call_api(api, "POST", "/recordings/drive/pause", "").0, 202);
     let paused = wait_for(api, "drive", |recording| recording["state"] == "paused");
     let held = of(&paused, "messages");
     let resumed = |recording: &Value| {
@@ -108,13 +108,13 @@ fn a_headless_robot_records_on_request_and_lists_its_recordings() {
     };
     let paused = wait_for(api, "drive", resumed);
     assert_eq!(of(&paused, "messages"), held);
-    assert_eq!(ask(api, "POST", "/recordings/drive/resume", "").0, 202);
+    assert_eq!(call_api(api, "POST", "/recordings/drive/resume", "").0, 202);
     wait_for(api, "drive", |recording| {
         of(recording, "messages") > held + 3
     });
 
     agent.wait_for_metric("ros2probe_recordings", |count| count == 1.0);
-    let (status, ended) = ask(api, "DELETE", "/recordings/drive", "");
+    let (status, ended) = call_api(api, "DELETE", "/recordings/drive", "");
     assert_eq!(
         (status, &ended["state"]),
         (200, &Value::from("ended")),
@@ -139,7 +139,7 @@ fn a_headless_robot_records_on_request_and_lists_its_recordings() {
     let events = local_agent::request(api, "GET", "/events?after=0&follow=false", "").body;
     assert!(events.contains("ros2probe.recording.started") && events.contains(r#""missing":0"#));
     // A repeated request has no effect.
-    assert_eq!(ask(api, "DELETE", "/recordings/drive", "").0, 200);
+    assert_eq!(call_api(api, "DELETE", "/recordings/drive", "").0, 200);
 }
 
 #[test]
@@ -151,9 +151,12 @@ fn a_recording_that_reaches_a_limit_ends_with_the_reason_and_the_next_is_refused
         "  max_total_bytes: 1000000\n  reserve_bytes: 65536\n  reserve_percent: 0\n",
     );
     let api = agent.api;
-    let (_, all) = ask(api, "GET", "/recordings", "");
+    let (_, all) = call_api(api, "GET", "/recordings", "");
     assert_eq!(all["limits"]["max_total_bytes"], 1_000_000, "{all}");
-    assert_eq!(ask(api, "POST", "/recordings", r#"{"name": "cut"}"#).0, 201);
+    assert_eq!(
+        call_api(api, "POST", "/recordings", r#"{"name": "cut"}"#).0,
+        201
+    );
     wait_for(api, "cut", |recording| {
         recording["report"]["messages"].as_u64() > Some(5)
     });
@@ -181,7 +184,7 @@ fn a_recording_that_reaches_a_limit_ends_with_the_reason_and_the_next_is_refused
     }
     let events = local_agent::request(api, "GET", "/events?after=0&follow=false", "").body;
     assert!(events.contains("recordings.max_total_bytes"), "{events}");
-    let (status, refused) = ask(api, "POST", "/recordings", r#"{"name": "next"}"#);
+    let (status, refused) = call_api(api, "POST", "/recordings", r#"{"name": "next"}"#);
     assert_eq!(status, 507, "{refused}");
     assert!(!bags.join("next").exists());
 }
@@ -190,7 +193,7 @@ fn a_recording_that_reaches_a_limit_ends_with_the_reason_and_the_next_is_refused
 fn a_recording_that_would_use_the_reserve_is_refused() {
     let directory = tempfile::tempdir().unwrap();
     let agent = agent(directory.path(), "  reserve_bytes: 1099511627776\n");
-    let (status, refused) = ask(agent.api, "POST", "/recordings", r#"{"name": "none"}"#);
+    let (status, refused) = call_api(agent.api, "POST", "/recordings", r#"{"name": "none"}"#);
     assert_eq!(status, 507, "{refused}");
     let detail = refused["detail"].as_str().unwrap();
     assert!(detail.contains("recordings.reserve_bytes"), "{detail}");
@@ -217,7 +220,7 @@ fn an_invalid_recording_is_refused_and_leaves_no_files() {
         r#"{"domain_id": 300}"#,
         r#"{"no_such_key": 1}"#,
     ] {
-        let (status, problem) = ask(agent.api, "POST", "/recordings", body);
+        let (status, problem) = call_api(agent.api, "POST", "/recordings", body);
         assert_eq!(status, 422, "{body}: {problem}");
         assert_eq!(
             problem["type"], "urn:ros2probe:problem:invalid-request",
@@ -227,18 +230,18 @@ fn an_invalid_recording_is_refused_and_leaves_no_files() {
     assert!(!directory.path().join("bags").exists());
     assert!(!directory.path().join("escape").exists());
     for path in ["/recordings/none", "/recordings/..%2F", "/snapshots"] {
-        let (status, _) = ask(agent.api, "GET", path, "");
+        let (status, _) = call_api(agent.api, "GET", path, "");
         assert_eq!(
             status,
             if path == "/snapshots" { 200 } else { 404 },
             "{path}"
         );
     }
-    assert_eq!(ask(agent.api, "POST", "/snapshots/none", "").0, 404);
+    assert_eq!(call_api(agent.api, "POST", "/snapshots/none", "").0, 404);
     drop(agent);
 
     let nowhere = LocalAgent::start(&mut rp(), &["--speed", "0.5"]);
-    let (status, problem) = ask(nowhere.api, "POST", "/recordings", "{}");
+    let (status, problem) = call_api(nowhere.api, "POST", "/recordings", "{}");
     assert_eq!(status, 409, "{problem}");
     assert!(
         problem["detail"]
@@ -271,12 +274,12 @@ fn the_seconds_before_the_violation_of_an_expectation_are_written_to_a_bag() {
     assert!(events.contains("ros2probe.snapshot.taken"), "{events}");
 
     // A request writes the messages in memory, even in the same second.
-    let (status, written) = ask(agent.api, "POST", "/snapshots/incident", "");
+    let (status, written) = call_api(agent.api, "POST", "/snapshots/incident", "");
     assert_eq!(status, 201, "{written}");
     let path = Path::new(written["directory"].as_str().unwrap());
     let count: usize = messages(path).values().map(Vec::len).sum();
     assert_eq!(written["messages"], count as u64);
-    let (_, list) = ask(agent.api, "GET", "/snapshots", "");
+    let (_, list) = call_api(agent.api, "GET", "/snapshots", "");
     assert_eq!(list["snapshots"][0]["written"], 2, "{list}");
     assert_eq!(list["snapshots"][0]["failed"], 0, "{list}");
 }
@@ -366,9 +369,9 @@ fn without_retention_a_late_echo_reports_the_missing_latched_message() {
         &host,
     ];
     let echoed = rp().args(echo).output().unwrap();
-    let said = String::from_utf8(echoed.stderr).unwrap();
+    let printed = String::from_utf8(echoed.stderr).unwrap();
     let missing = "the latched message of /tf_static is not kept: set `retain: last` in a watch";
-    assert!(said.contains(missing), "{said}");
+    assert!(printed.contains(missing), "{printed}");
     assert!(echoed.stdout.is_empty());
 }
 
@@ -379,12 +382,12 @@ fn sent_once() -> PathBuf {
 /// Records until the recording has this number of messages of `/tf_static`.
 fn record_late(agent: &LocalAgent, messages: u64) -> Value {
     let body = r#"{"name": "late", "topics": {"topics": ["/tf_static", "/chatter"]}}"#;
-    let (status, begun) = ask(agent.api, "POST", "/recordings", body);
+    let (status, begun) = call_api(agent.api, "POST", "/recordings", body);
     assert_eq!(status, 201, "{begun}");
     wait_for(agent.api, "late", |recording| {
         recording["report"]["topics"]["/tf_static"]["messages"] == messages
     });
-    let (status, ended) = ask(agent.api, "DELETE", "/recordings/late", "");
+    let (status, ended) = call_api(agent.api, "DELETE", "/recordings/late", "");
     assert_eq!(status, 200, "{ended}");
     ended
 }
@@ -403,16 +406,16 @@ fn snapshots_without_a_directory_are_an_error_only_if_the_directory_is_off() {
             .arg(&configuration)
             .output()
             .unwrap();
-        let said = String::from_utf8_lossy(&output.stderr).into_owned();
-        (output.status.code(), output.stdout.len(), said)
+        let printed = String::from_utf8_lossy(&output.stderr).into_owned();
+        (output.status.code(), output.stdout.len(), printed)
     };
     // A replay has no state directory, like an agent whose disk is missing.
-    let (code, length, said) = run("");
-    assert_eq!(code, Some(0), "{said}");
-    assert!(length > 1000 && said.contains("snapshots are disabled"));
-    let (code, _, said) = run("state_directory: off\n");
-    assert_eq!(code, Some(1), "{said}");
-    assert!(said.contains("the agent has no directory for recordings"));
+    let (code, length, printed) = run("");
+    assert_eq!(code, Some(0), "{printed}");
+    assert!(length > 1000 && printed.contains("snapshots are disabled"));
+    let (code, _, printed) = run("state_directory: off\n");
+    assert_eq!(code, Some(1), "{printed}");
+    assert!(printed.contains("the agent has no directory for recordings"));
 }
 
 /// Converts a capture. Returns the exit code of `rp bag convert`, its standard error, and the
@@ -426,12 +429,12 @@ fn converted(capture: &Path, bag: &Path, options: &[&str]) -> (Option<i32>, Stri
     command.env_remove("ROS_DISTRO").env_remove("ROS_DOMAIN_ID");
     let output = command.stdin(Stdio::null()).output().unwrap();
     assert!(output.stdout.is_empty(), "{output:?}");
-    let said = String::from_utf8(output.stderr).unwrap();
+    let printed = String::from_utf8(output.stderr).unwrap();
     let metadata = std::fs::read_to_string(bag.join("metadata.yaml")).unwrap_or_default();
     let metadata = ros2probe_bag::metadata::Metadata::read(&metadata).ok();
     let report = metadata.and_then(|mut metadata| metadata.custom_data.remove("ros2probe"));
     let report = report.map(|report| serde_json::from_str(&report).unwrap());
-    (output.status.code(), said, report.unwrap_or_default())
+    (output.status.code(), printed, report.unwrap_or_default())
 }
 
 /// Writes a capture of one minute with `MANY` topics, each with one message per second.
@@ -461,7 +464,7 @@ fn many_topics(path: &Path) {
 struct Recording {
     child: Child,
     lines: Receiver<String>,
-    said: Vec<String>,
+    printed: Vec<String>,
 }
 
 impl Recording {
@@ -485,7 +488,7 @@ impl Recording {
         Self {
             child,
             lines,
-            said: Vec::new(),
+            printed: Vec::new(),
         }
     }
 
@@ -495,10 +498,10 @@ impl Recording {
         loop {
             let left = PATIENCE.saturating_sub(begun.elapsed());
             let Ok(line) = self.lines.recv_timeout(left) else {
-                panic!("no `{text}` in {:#?}", self.said);
+                panic!("no `{text}` in {:#?}", self.printed);
             };
-            self.said.push(line);
-            if self.said.last().unwrap().contains(text) {
+            self.printed.push(line);
+            if self.printed.last().unwrap().contains(text) {
                 return begun.elapsed();
             }
         }
@@ -517,10 +520,10 @@ impl Recording {
             if let Some(status) = self.child.try_wait().unwrap() {
                 break status;
             }
-            assert!(begun.elapsed() < PATIENCE, "{:#?}", self.said);
+            assert!(begun.elapsed() < PATIENCE, "{:#?}", self.printed);
             std::thread::sleep(Duration::from_millis(20));
         };
-        self.said.extend(self.lines.iter());
+        self.printed.extend(self.lines.iter());
         (status, begun.elapsed())
     }
 }

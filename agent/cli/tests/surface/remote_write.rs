@@ -76,8 +76,8 @@ fn is_constant(labels: &Labels) -> bool {
     !changes(name) && !name.starts_with("ros2probe_remote_write_") && name != "up"
 }
 
-/// Asserts that the last samples are those of the page. A figure may change between the two, so that
-/// the next samples count, too.
+/// Asserts that the last samples are those of the page. A figure may change between the two, so
+/// that the next samples count, too.
 fn assert_same_as_page(receiver: &Receiver, agent: &LocalAgent) {
     let mut difference = String::new();
     for _ in 0..5 {
@@ -159,7 +159,7 @@ fn a_receiver_of_version_1_gets_the_same_series() {
 }
 
 #[test]
-fn samples_that_a_receiver_cannot_store_yet_come_later_in_order_and_once() {
+fn samples_refused_temporarily_are_sent_later_in_order_and_once() {
     let directory = tempfile::tempdir().unwrap();
     let mut answers = [500, 429, 401, 503].into_iter();
     let receiver = Receiver::start(move |write| match answers.next() {
@@ -191,7 +191,7 @@ fn samples_that_a_receiver_cannot_store_yet_come_later_in_order_and_once() {
 }
 
 #[test]
-fn samples_that_a_receiver_refuses_take_no_others_along() {
+fn a_sample_that_a_receiver_refuses_drops_no_other_sample() {
     let directory = tempfile::tempdir().unwrap();
     let receiver = Receiver::start(|_| Reply::status(503));
     let mut agent = sending(&receiver, directory.path(), "");
@@ -387,7 +387,7 @@ fn the_rate_of_bytes_is_limited() {
 }
 
 #[test]
-fn invalid_sections_are_refused_with_their_place() {
+fn invalid_sections_are_refused_with_their_position() {
     let directory = tempfile::tempdir().unwrap();
     let configuration = directory.path().join("ros2probe.yaml");
     let report = |section: &str| {

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use crate::events::kept;
 use crate::page::{data, get};
 use crate::rp;
-use ros2probe_testing::local_agent::{LocalAgent, PATIENCE, ask};
+use ros2probe_testing::local_agent::{LocalAgent, PATIENCE, call_api};
 use serde_json::{Value, json};
 
 /// Returns the replay once it is as wanted.
@@ -22,7 +22,7 @@ fn wait_for(agent: &LocalAgent, what: &str, is_wanted: impl Fn(&Value) -> bool) 
 }
 
 fn change(agent: &LocalAgent, change: &Value) -> Value {
-    let (status, body) = ask(agent.api, "POST", "/replay", &change.to_string());
+    let (status, body) = call_api(agent.api, "POST", "/replay", &change.to_string());
     assert_eq!(status, 200, "{change}: {body}");
     body
 }
@@ -45,7 +45,7 @@ fn second(event: &Value) -> f64 {
 }
 
 #[test]
-fn a_replay_stands_still_goes_to_a_time_and_to_the_next_event() {
+fn a_replay_pauses_and_jumps_to_a_time_and_to_the_next_event() {
     let capture = data("cyclonedds/points-besteffort-lossy-2ns");
     let arguments = ["--watch", "/**", "--speed", "0.1"];
     let agent = LocalAgent::replay(&mut rp(), &capture, &arguments);
@@ -66,7 +66,7 @@ fn a_replay_stands_still_goes_to_a_time_and_to_the_next_event() {
     std::thread::sleep(Duration::from_millis(1_500));
     assert_eq!(time(&get(&agent, "/replay")), time(&held));
     let past = json!({"to_timestamp_seconds": time(&held) - 1.0});
-    let (status, _) = ask(agent.api, "POST", "/replay", &past.to_string());
+    let (status, _) = call_api(agent.api, "POST", "/replay", &past.to_string());
     assert_eq!(status, 422);
 
     // A jump ends exactly at its time, and the replay stands still again.

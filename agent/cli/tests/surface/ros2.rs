@@ -31,10 +31,10 @@ pub fn stderr(output: &Output) -> String {
 
 /// Asserts that the command fails with exit code 1 and with one line that has this part.
 fn fails_with(output: &Output, part: &str) {
-    let said = stderr(output);
-    assert_eq!(output.status.code(), Some(1), "{said}");
-    assert_eq!(said.lines().count(), 1, "{said}");
-    assert!(said.contains(part), "`{part}` is not in {said}");
+    let printed = stderr(output);
+    assert_eq!(output.status.code(), Some(1), "{printed}");
+    assert_eq!(printed.lines().count(), 1, "{printed}");
+    assert!(printed.contains(part), "`{part}` is not in {printed}");
 }
 
 #[test]
@@ -195,16 +195,16 @@ fn a_capture_is_listed_up_to_the_requested_time() {
         assert_eq!(listed.status.code(), Some(0), "{}", stderr(&listed));
         (stdout(&listed), stderr(&listed))
     };
-    let (none, said) = list(&["-c", "--until", "+0"]);
+    let (none, printed) = list(&["-c", "--until", "+0"]);
     assert_eq!(none, "0\n");
     assert_eq!(
-        said,
+        printed,
         "rp: 1 participant is known, but none of its topics: a participant that is alone announces \
          none\n"
     );
     let whole = list(&[]);
-    let (names, said) = &whole;
-    assert_eq!(said, "");
+    let (names, printed) = &whole;
+    assert_eq!(printed, "");
     assert!(names.contains("/rosout\n"), "{names}");
     assert_eq!(list(&["--until", "+86400"]), whole);
 

@@ -32,9 +32,9 @@ fn promtool(arguments: &[&str]) -> Result<()> {
         .current_dir(rules())
         .output()
         .context(INSTALL)?;
-    let said = String::from_utf8_lossy(&output.stdout);
+    let printed = String::from_utf8_lossy(&output.stdout);
     let failed = String::from_utf8_lossy(&output.stderr);
-    ensure!(output.status.success(), "{said}{failed}");
+    ensure!(output.status.success(), "{printed}{failed}");
     Ok(())
 }
 

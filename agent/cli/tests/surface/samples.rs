@@ -78,11 +78,11 @@ pub(crate) fn replayed(capture: &Path, depth: Option<Depth>) -> (Snapshot, Vec<S
     }
     let mut reader = PcapReader::open(capture, Expansion::Limited).unwrap();
     let mut feed = FrameDecoder::new(Limits::default());
-    let mut news = Vec::new();
+    let mut outcomes = Vec::new();
     let mut take = |observer: &mut Observer| {
         for given in observer.drain().samples {
             assert_eq!(*given.to, [1]);
-            news.push(given.outcome);
+            outcomes.push(given.outcome);
         }
     };
     while let Some(captured) = reader.next_packet().unwrap() {
@@ -97,17 +97,17 @@ pub(crate) fn replayed(capture: &Path, depth: Option<Depth>) -> (Snapshot, Vec<S
     for topic in &mut snapshot.topics {
         topic.is_read = false;
     }
-    (snapshot, news)
+    (snapshot, outcomes)
 }
 
 /// Returns the numbers of samples and bytes by topic. Each sample must be unique, and the times
 /// must not decrease, except by some nanoseconds.
-fn counts(news: &[SampleOutcome], depth: Depth) -> BTreeMap<(DomainId, String), (u64, u64)> {
+fn counts(outcomes: &[SampleOutcome], depth: Depth) -> BTreeMap<(DomainId, String), (u64, u64)> {
     let mut counts: BTreeMap<_, (u64, u64)> = BTreeMap::new();
     let mut seen = BTreeSet::new();
     let mut last = 0;
-    for news in news {
-        let SampleOutcome::Sample(sample) = news else {
+    for outcome in outcomes {
+        let SampleOutcome::Sample(sample) = outcome else {
             continue;
         };
         assert!(seen.insert((sample.writer, sample.sequence_number)));
@@ -125,8 +125,8 @@ fn counts(news: &[SampleOutcome], depth: Depth) -> BTreeMap<(DomainId, String), 
     counts
 }
 
-fn unannounced(news: &[SampleOutcome], dds_name: &str) -> u64 {
-    let missed = news.iter().filter_map(|news| match news {
+fn unannounced(outcomes: &[SampleOutcome], dds_name: &str) -> u64 {
+    let missed = outcomes.iter().filter_map(|outcome| match outcome {
         SampleOutcome::Missed(missed) if missed.reason == MissedReason::Unannounced => Some(missed),
         _ => None,
     });
@@ -148,10 +148,10 @@ fn a_sample_request_changes_no_count_and_gets_each_counted_sample_once() {
             if depth == Depth::Payloads && is_cut(&alone) {
                 continue;
             }
-            let (with, news) = replayed(&capture, Some(depth));
+            let (with, outcomes) = replayed(&capture, Some(depth));
             let name = capture.display();
             assert_eq!(format!("{alone:?}"), format!("{with:?}"), "{name}");
-            let mut counts = counts(&news, depth);
+            let mut counts = counts(&outcomes, depth);
             let (mut incomplete, mut lost) = (0, 0);
             for topic in &with.topics {
                 let Some(measured) = &topic.measurement else {
@@ -160,7 +160,7 @@ fn a_sample_request_changes_no_count_and_gets_each_counted_sample_once() {
                 let key = (topic.domain_id, topic.dds_name.to_string());
                 let given = counts.remove(&key).unwrap_or_default();
                 // Earlier samples of an unknown writer count for its topic after its announcement.
-                let unannounced = unannounced(&news, &key.1);
+                let unannounced = unannounced(&outcomes, &key.1);
                 assert_eq!(given.0 + unannounced, measured.messages, "{name}: {key:?}");
                 if unannounced == 0 {
                     assert_eq!(given.1, measured.bytes, "{name}: {key:?}");
@@ -170,7 +170,7 @@ fn a_sample_request_changes_no_count_and_gets_each_counted_sample_once() {
                 lost += measured.lost;
             }
             assert!(counts.is_empty(), "{name}: {counts:?}");
-            let missed = news.iter().filter_map(|news| match news {
+            let missed = outcomes.iter().filter_map(|outcome| match outcome {
                 SampleOutcome::Missed(missed) => Some((missed.reason, missed.samples)),
                 SampleOutcome::Sample(_) => None,
             });
@@ -218,8 +218,8 @@ fn a_subscription_gets_the_messages_of_a_reliable_subscriber_in_order_and_on_tim
         let capture = directory.join("capture.pcap.gz");
         for depth in [Depth::Arrivals, Depth::Payloads] {
             let (mut given, mut lost, mut early) = (Vec::new(), BTreeSet::new(), 0);
-            for news in replayed(&capture, Some(depth)).1 {
-                match news {
+            for outcome in replayed(&capture, Some(depth)).1 {
+                match outcome {
                     SampleOutcome::Sample(sample) if &*sample.topic.name == "/chatter" => {
                         given.push((sample.sequence_number - SequenceNumber(1), sample.time.0));
                     }
@@ -309,7 +309,7 @@ impl Robot {
     }
 
     /// Returns writer, number and payload of each sample, or the reason for a missed sample.
-    fn given(&mut self) -> Vec<(GuidPrefix, u64, Result<Vec<u8>, MissedReason>)> {
+    fn payloads_of(&mut self) -> Vec<(GuidPrefix, u64, Result<Vec<u8>, MissedReason>)> {
         let given = self.observer.drain().samples.into_iter();
         given
             .map(|given| match given.outcome {
@@ -340,7 +340,7 @@ fn fragments_are_assembled_and_samples_are_delivered_in_the_order_of_completion(
         robot.fragment(ALICE, 1, start, &large);
         robot.fragment(BOB, 1, start.min(2), &small);
     }
-    assert_eq!(robot.given(), [(BOB, 1, Ok(small.clone()))]);
+    assert_eq!(robot.payloads_of(), [(BOB, 1, Ok(small.clone()))]);
     for start in [5, 1, 4] {
         robot.fragment(ALICE, 1, start, &large);
     }
@@ -350,7 +350,7 @@ fn fragments_are_assembled_and_samples_are_delivered_in_the_order_of_completion(
     let guid = Guid::new(BOB, WRITER);
     robot.put(Message::from(BOB).dispose_by_key(WRITER, 3, 0x70, guid));
     let expected = [(ALICE, 1, Ok(large)), (BOB, 2, Ok(small[..400].to_vec()))];
-    assert_eq!(robot.given(), expected);
+    assert_eq!(robot.payloads_of(), expected);
 }
 
 #[test]
@@ -365,7 +365,7 @@ fn a_sample_that_stays_incomplete_is_reported_and_not_delivered() {
     robot
         .observer
         .input(Input::Time(Timestamp(robot.at + 30 * SECOND)));
-    let given: Vec<_> = robot.given();
+    let given: Vec<_> = robot.payloads_of();
     let expected = [
         (ALICE, 1, Ok(payload(20))),
         (ALICE, 3, Ok(payload(24))),
@@ -422,15 +422,15 @@ fn sample_requests_measure_unwatched_topics_until_the_last_request_ends() {
     robot.subscribe(&["/points"], Depth::Arrivals);
     assert_eq!(verdict(&mut robot), Some(Verdict::Meter));
     robot.put(Message::from(ALICE).data(WRITER, 2, &payload(20)));
-    assert_eq!(robot.given(), [(ALICE, 2, Ok(Vec::new()))]);
+    assert_eq!(robot.payloads_of(), [(ALICE, 2, Ok(Vec::new()))]);
     robot.subscribe(&["/points"], Depth::Payloads);
     assert_eq!(verdict(&mut robot), Some(Verdict::Capture));
     robot.put(Message::from(ALICE).data(WRITER, 3, &payload(20)));
-    assert_eq!(robot.given(), [(ALICE, 3, Ok(payload(20)))]);
+    assert_eq!(robot.payloads_of(), [(ALICE, 3, Ok(payload(20)))]);
     robot.observer.input(Input::SampleRequests(Arc::default()));
     assert_eq!(verdict(&mut robot), Some(Verdict::Ignore));
     robot.put(Message::from(ALICE).data(WRITER, 4, &payload(20)));
-    assert!(robot.given().is_empty());
+    assert!(robot.payloads_of().is_empty());
     let snapshot = robot.observer.snapshot(Timestamp(robot.at));
     assert!(snapshot.watches.is_empty());
     let points = snapshot.topics.iter().find(|topic| topic.name == "/points");
@@ -458,7 +458,7 @@ fn samples_beyond_the_cap_in_bytes_are_reported_and_memory_is_bounded() {
         robot.put(Message::from(ALICE).data(WRITER, number, &payload(10_000)));
         assert!(held(&robot) <= 100_000);
     }
-    let given = robot.given();
+    let given = robot.payloads_of();
     let (whole, missed): (Vec<_>, Vec<_>) = given.iter().partition(|given| given.2.is_ok());
     assert_eq!(given.len(), 20);
     assert!(
@@ -481,7 +481,7 @@ fn samples_beyond_the_cap_in_bytes_are_reported_and_memory_is_bounded() {
     for start in 1..=30 {
         robot.fragment(ALICE, 60, start, &large);
     }
-    assert!(robot.given().contains(&(ALICE, 60, Ok(large))));
+    assert!(robot.payloads_of().contains(&(ALICE, 60, Ok(large))));
 }
 
 #[test]

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use crate::rp;
 use ros2probe_bag::{Options, TopicDescription, Writer};
-use ros2probe_testing::s3::{BUCKET, Call, Fate, Operation, Store, hex};
+use ros2probe_testing::s3::{BUCKET, Call, Operation, RequestOutcome, Store, hex};
 use ros2probe_wire::Timestamp;
 use serde_json::{Value, json};
 use tempfile::TempDir;
@@ -337,7 +337,7 @@ fn a_bag_arrives_in_a_folder_with_its_manifest() {
 }
 
 #[test]
-fn a_folder_that_is_not_there_is_not_created() {
+fn a_missing_folder_is_not_created() {
     let folder = tempfile::tempdir().unwrap();
     let missing = folder.path().join("not-mounted");
     let robot = Robot::to(&format!("file://{}", missing.display()), "");
@@ -384,12 +384,12 @@ fn a_store_that_refuses_and_cuts_has_each_bag_once_in_the_end() {
     store.decide(move |call| {
         number += 1;
         match number % 12 {
-            2 => Fate::Refuse(500, None),
-            4 => Fate::Refuse(429, Some(1)),
-            6 => Fate::Refuse(403, None),
-            8 => Fate::CutAfter(call.length / 2),
-            10 => Fate::CutAnswer,
-            _ => Fate::Serve,
+            2 => RequestOutcome::Refuse(500, None),
+            4 => RequestOutcome::Refuse(429, Some(1)),
+            6 => RequestOutcome::Refuse(403, None),
+            8 => RequestOutcome::CutAfter(call.length / 2),
+            10 => RequestOutcome::CutAnswer,
+            _ => RequestOutcome::Serve,
         }
     });
     robot.record("drive", 17 * MIB, 100);
@@ -410,18 +410,18 @@ fn a_store_that_refuses_and_cuts_has_each_bag_once_in_the_end() {
 }
 
 #[test]
-fn a_store_out_of_reach_is_reported_and_nothing_is_lost() {
+fn an_unreachable_store_is_reported_and_no_bag_is_lost() {
     let store = Store::start();
     let robot = Robot::of(&store);
     robot.record("drive", 1000, 100);
-    store.decide(|_| Fate::CutAfter(0));
+    store.decide(|_| RequestOutcome::CutAfter(0));
     let output = robot.once();
     assert_eq!(output.status.code(), Some(1), "{output:?}");
     let error = String::from_utf8(output.stderr).unwrap();
     assert!(error.contains("the store is out of reach"), "{error}");
     assert_eq!(robot.status()["waiting_bags"], 1);
     assert!(robot.bag("drive").exists());
-    store.decide(|_| Fate::Serve);
+    store.decide(|_| RequestOutcome::Serve);
     robot.delivers();
     assert_stored(&store, &robot, "drive");
 }
@@ -477,7 +477,11 @@ fn an_upload_whose_completion_was_not_confirmed_is_not_repeated() {
     store.decide(move |call| {
         let cuts = call.operation == Operation::Complete && !is_cut;
         is_cut |= cuts;
-        if cuts { Fate::CutAnswer } else { Fate::Serve }
+        if cuts {
+            RequestOutcome::CutAnswer
+        } else {
+            RequestOutcome::Serve
+        }
     });
     robot.record("drive", 12 * MIB, 100);
     robot.delivers();
@@ -491,13 +495,13 @@ fn an_upload_that_the_store_dropped_begins_again() {
     let store = Store::start();
     let robot = Robot::of(&store);
     store.decide(|call| match call.operation {
-        Operation::Part(2) => Fate::Refuse(503, None),
-        _ => Fate::Serve,
+        Operation::Part(2) => RequestOutcome::Refuse(503, None),
+        _ => RequestOutcome::Serve,
     });
     robot.record("drive", 12 * MIB, 100);
     assert_eq!(robot.once().status.code(), Some(1));
     store.expire_uploads();
-    store.decide(|_| Fate::Serve);
+    store.decide(|_| RequestOutcome::Serve);
     robot.delivers();
     assert_stored(&store, &robot, "drive");
 }
@@ -607,7 +611,7 @@ fn delivered_bags_are_deleted_only_if_space_is_needed_and_the_store_has_them() {
     assert_eq!(robot.status()["deleted_bags"], 2);
     assert_eq!(store.objects().len(), 6);
     // A bag that the store does not have stays.
-    store.decide(|_| Fate::Refuse(503, None));
+    store.decide(|_| RequestOutcome::Refuse(503, None));
     robot.record("new", 90_000, 10);
     assert_eq!(robot.once().status.code(), Some(1));
     assert!(robot.bag("new").exists());

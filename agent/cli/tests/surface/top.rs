@@ -173,8 +173,8 @@ fn with_once_rp_top_prints_a_table_without_a_terminal() {
     let agent = agent();
     let address = agent.api.to_string();
     let live = ["--host", &address];
-    let (code, table, said) = output(&live, &["--once", "--sort", "rate"]);
-    assert_eq!((code, said.as_str()), (Some(0), ""));
+    let (code, table, printed) = output(&live, &["--once", "--sort", "rate"]);
+    assert_eq!((code, printed.as_str()), (Some(0), ""));
     let lines: Vec<_> = table.lines().map(str::trim_end).collect();
     assert!(lines[0].starts_with("rp top  "), "{table}");
     let heading = lines
@@ -198,19 +198,19 @@ fn with_once_rp_top_prints_a_table_without_a_terminal() {
     // A capture leads to the same table without an agent.
     let capture = capture();
     let replayed = ["--replay", capture.to_str().unwrap()];
-    let (code, from_capture, said) = output(&replayed, &["--once", "--sort", "rate"]);
-    assert_eq!((code, said.as_str()), (Some(0), ""));
+    let (code, from_capture, printed) = output(&replayed, &["--once", "--sort", "rate"]);
+    assert_eq!((code, printed.as_str()), (Some(0), ""));
     let rows = |table: &str| {
         let lines = table.lines().skip_while(|line| !line.starts_with("TOPIC "));
         lines.map(ToOwned::to_owned).collect::<Vec<_>>()
     };
     assert_eq!(rows(&from_capture), rows(&table));
 
-    let (code, _, said) = output(&live, &[]);
+    let (code, _, printed) = output(&live, &[]);
     assert_eq!(code, Some(1));
     assert!(
-        said.contains("needs a terminal") && said.lines().count() == 1,
-        "{said}"
+        printed.contains("needs a terminal") && printed.lines().count() == 1,
+        "{printed}"
     );
 }
 

@@ -40,10 +40,10 @@ fn stdout(output: &Output) -> String {
 
 /// Asserts that a command fails with one line that has this text.
 fn fails(output: &Output, text: &str) {
-    let said = String::from_utf8(output.stderr.clone()).unwrap();
-    assert_eq!(output.status.code(), Some(1), "{said}");
-    assert_eq!(said.lines().count(), 1, "{said}");
-    assert!(said.contains(text), "{said}");
+    let printed = String::from_utf8(output.stderr.clone()).unwrap();
+    assert_eq!(output.status.code(), Some(1), "{printed}");
+    assert_eq!(printed.lines().count(), 1, "{printed}");
+    assert!(printed.contains(text), "{printed}");
     assert!(output.stdout.is_empty());
 }
 
@@ -128,7 +128,7 @@ fn a_newer_version_is_printed_with_its_file_and_the_command_that_installs_it() {
 }
 
 #[test]
-fn the_same_version_or_an_older_one_is_no_upgrade() {
+fn the_same_or_an_older_version_is_not_an_upgrade() {
     let directory = tempfile::tempdir().unwrap();
     for version in [OWN, "0.0.9"] {
         let path = write(directory.path(), "release.json", &feed(version));
@@ -184,7 +184,7 @@ fn a_feed_over_https_needs_a_certificate_of_a_known_authority() {
 }
 
 #[test]
-fn what_is_no_feed_is_reported_in_one_line() {
+fn an_invalid_feed_is_reported_in_one_line() {
     let directory = tempfile::tempdir().unwrap();
     fails(
         &check("/nowhere.json", &[]),

@@ -54,8 +54,8 @@ fn curl(arguments: &[&str]) -> Output {
 /// Returns the HTTP status of the answer to curl.
 fn status(arguments: &[&str]) -> String {
     let output = curl(arguments);
-    let said = String::from_utf8(output.stdout).unwrap();
-    said.lines().last().unwrap_or_default().to_owned()
+    let printed = String::from_utf8(output.stdout).unwrap();
+    printed.lines().last().unwrap_or_default().to_owned()
 }
 
 #[test]
@@ -102,17 +102,17 @@ fn refused(web: &Web) -> String {
 
 #[test]
 fn an_invalid_web_config_prevents_the_start_of_the_agent() {
-    let said = refused(&Web::new("basic_auth_users:\n  alice: secret\n"));
+    let printed = refused(&Web::new("basic_auth_users:\n  alice: secret\n"));
     assert!(
-        said.contains("the hash of `alice` is not a bcrypt hash"),
-        "{said}"
+        printed.contains("the hash of `alice` is not a bcrypt hash"),
+        "{printed}"
     );
     let web = Web::new("");
     std::fs::remove_file(web.path("web.yml")).unwrap();
-    let said = refused(&web);
+    let printed = refused(&web);
     assert!(
-        said.contains("web.yml (`metrics.web_config`): No such file"),
-        "{said}"
+        printed.contains("web.yml (`metrics.web_config`): No such file"),
+        "{printed}"
     );
 }
 
@@ -123,8 +123,11 @@ fn an_encrypted_listener_answers_only_clients_that_trust_its_certificate() {
         "tls_server_config: {{cert_file: a.crt, key_file: a.key, min_version: TLS13}}\n\
          basic_auth_users: {{alice: {hash}}}\n"
     ));
-    let said = refused(&web);
-    assert!(said.contains("a.crt") || said.contains("a.key"), "{said}");
+    let printed = refused(&web);
+    assert!(
+        printed.contains("a.crt") || printed.contains("a.key"),
+        "{printed}"
+    );
     let made = Command::new("openssl")
         .args([
             "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2",

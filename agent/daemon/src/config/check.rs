@@ -11,7 +11,7 @@ use super::meaning::check_text;
 use super::mistake::Mistakes;
 
 /// Common wrong keys and their correct names: former names first, then likely guesses.
-const RENAMED: &[(&str, &str)] = &[
+const COMMON_MISTAKES: &[(&str, &str)] = &[
     ("watchlist", "watch"),
     ("watches", "watch"),
     ("topic_grace", "topic_grace_s"),
@@ -144,7 +144,7 @@ fn wrong_kind(node: &Node, path: &str, expected: &[String], found: &mut Mistakes
 
 fn unknown_key<'a>(name: &str, known: impl Iterator<Item = &'a str> + Clone) -> String {
     let has = |key: &&str| known.clone().any(|other| other == *key);
-    let renamed = RENAMED
+    let renamed = COMMON_MISTAKES
         .iter()
         .filter(|(old, _)| *old == name)
         .map(|(_, new)| *new)

@@ -75,17 +75,17 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Config, Mistakes> {
 }
 
 /// The reader of each version of the file, the oldest first.
-const READERS: &[(u32, Read)] = &[(1, read_1)];
+const VERSION_READERS: &[(u32, Read)] = &[(1, read_1)];
 type Read = fn(&str, &Node) -> Result<Config, Mistakes>;
 
 /// Returns the reader for the version of the file, which defaults to the first version. In a newer
 /// file only the version is reported, since the meaning of its other keys is unknown.
 fn reader(document: &Node, mistakes: &mut Mistakes) -> Option<Read> {
-    let newest = READERS.last().map_or(0, |(version, _)| *version);
+    let newest = VERSION_READERS.last().map_or(0, |(version, _)| *version);
     let Some((version, position)) = document.version() else {
-        return READERS.first().map(|(_, read)| *read);
+        return VERSION_READERS.first().map(|(_, read)| *read);
     };
-    let known = READERS
+    let known = VERSION_READERS
         .iter()
         .find(|(known, _)| i128::from(*known) == version);
     if known.is_none() {
@@ -511,22 +511,22 @@ pub(super) enum InvalidText {
     #[error("is no field: {}", .0.message)]
     Field(#[from] FilterError),
     #[error("must be {0}")]
-    Unfit(&'static str),
+    Unsuitable(&'static str),
 }
 
 /// Checks the text at a key with restricted values.
 pub(super) fn check_text(key: &str, text: &str) -> Result<(), InvalidText> {
     match without_indices(key).as_str() {
         "watch[]" | "watch[].topic" | "recordings.snapshots[].topics[]" => Ok(check_pattern(text)?),
-        "chains[].from" | "chains[].to" if text.contains('*') => {
-            Err(InvalidText::Unfit("the name of one topic, as in `/points`"))
-        }
+        "chains[].from" | "chains[].to" if text.contains('*') => Err(InvalidText::Unsuitable(
+            "the name of one topic, as in `/points`",
+        )),
         "chains[].from" | "chains[].to" => Ok(check_pattern(text)?),
         "capture.interfaces.include[]"
         | "capture.interfaces.exclude[]"
         | "capture.mirror_interfaces[]" => {
             if text.is_empty() || text.contains(|c: char| c.is_whitespace() || c == '/') {
-                return Err(InvalidText::Unfit(
+                return Err(InvalidText::Unsuitable(
                     "an interface name or glob, as in `eth*`",
                 ));
             }
@@ -543,35 +543,35 @@ pub(super) fn check_text(key: &str, text: &str) -> Result<(), InvalidText> {
             InvalidText::RelativePath("`/var/lib/ros2probe`, `auto` or `off`"),
         ),
         "robot.diagnostic_values[]" if text.len() > 256 || !text.contains('/') => {
-            Err(InvalidText::Unfit(
+            Err(InvalidText::Unsuitable(
                 "name, slash and key, as in `battery*/Voltage*`, in at most 256 bytes",
             ))
         }
         "robot.active[]" | "robot.parameters_expected[].node"
             if text.len() > 256 || !text.starts_with('/') =>
         {
-            Err(InvalidText::Unfit(
+            Err(InvalidText::Unsuitable(
                 "the full name of a node, as in `/lidar`",
             ))
         }
         "robot.parameters_expected[].name" if text.is_empty() || text.len() > 128 => Err(
-            InvalidText::Unfit("the name of a parameter, in at most 128 bytes"),
+            InvalidText::Unsuitable("the name of a parameter, in at most 128 bytes"),
         ),
         "robot.parameters_expected[].value" if text.len() > 256 => {
-            Err(InvalidText::Unfit("at most 256 bytes long"))
+            Err(InvalidText::Unsuitable("at most 256 bytes long"))
         }
         "robot.extract[].topic" if text.contains('*') || check_pattern(text).is_err() => Err(
-            InvalidText::Unfit("the name of one topic, as in `/battery`"),
+            InvalidText::Unsuitable("the name of one topic, as in `/battery`"),
         ),
         "robot.extract[].field" => {
             Filter::of_field(text)?;
             Ok(())
         }
-        "robot.extract[].metric" if !is_metric(text) => Err(InvalidText::Unfit(
+        "robot.extract[].metric" if !is_metric(text) => Err(InvalidText::Unsuitable(
             "1 to 128 lower-case letters, digits and `_`, as in `robot_battery_ratio`; the \
              prefixes `ros2` and `process_`, and suffixes of other types, such as `_total`, are reserved",
         )),
-        "recordings.snapshots[].name" if !is_plain(text) => Err(InvalidText::Unfit(
+        "recordings.snapshots[].name" if !is_plain(text) => Err(InvalidText::Unsuitable(
             "1 to 64 letters, digits, `_` or `-`: it names directories",
         )),
         "recordings.snapshots[].trigger[]" if Trigger::parse(text).is_none() => {
@@ -589,7 +589,7 @@ pub(super) fn check_text(key: &str, text: &str) -> Result<(), InvalidText> {
                 .iter()
                 .any(|start| text.starts_with(start)) =>
         {
-            Err(InvalidText::Unfit(
+            Err(InvalidText::Unsuitable(
                 "an absolute path or an address, as in `https://example.org/release.json`",
             ))
         }
@@ -599,7 +599,7 @@ pub(super) fn check_text(key: &str, text: &str) -> Result<(), InvalidText> {
         "api.token_file" if !text.starts_with('/') => Err(InvalidText::RelativePath(
             "`/run/credentials/ros2probe.service/token`",
         )),
-        "foxglove.origins[]" if !is_origin(text) => Err(InvalidText::Unfit(
+        "foxglove.origins[]" if !is_origin(text) => Err(InvalidText::Unsuitable(
             "an origin, as in `https://app.foxglove.dev` or `file://`, without a path",
         )),
         key @ ("metrics.listen" | "api.listen" | "foxglove.listen")
@@ -613,15 +613,19 @@ pub(super) fn check_text(key: &str, text: &str) -> Result<(), InvalidText> {
             let text = text.to_owned();
             Err(InvalidText::Address { text, port })
         }
-        "otlp.endpoint" if text != "off" && otlp_endpoint(text).is_none() => Err(
-            InvalidText::Unfit("the URL of a receiver, as in `http://collector:4317`, or `off`"),
-        ),
+        "otlp.endpoint" if text != "off" && otlp_endpoint(text).is_none() => {
+            Err(InvalidText::Unsuitable(
+                "the URL of a receiver, as in `http://collector:4317`, or `off`",
+            ))
+        }
         "otlp.headers_file" if !text.starts_with('/') => {
             Err(InvalidText::RelativePath("`/etc/ros2probe/otlp.headers`"))
         }
-        "remote_write.url" if remote_write::receiver(text).is_none() => Err(InvalidText::Unfit(
-            "the URL of a receiver, as in `https://prometheus.example/api/v1/write`",
-        )),
+        "remote_write.url" if remote_write::receiver(text).is_none() => {
+            Err(InvalidText::Unsuitable(
+                "the URL of a receiver, as in `https://prometheus.example/api/v1/write`",
+            ))
+        }
         "remote_write.token_file"
         | "remote_write.ca_file"
         | "remote_write.certificate_file"
@@ -630,14 +634,14 @@ pub(super) fn check_text(key: &str, text: &str) -> Result<(), InvalidText> {
         {
             Err(InvalidText::RelativePath("`/etc/ros2probe/robot.pem`"))
         }
-        "ship.url" if !ros2probe_ship::is_destination(text) => Err(InvalidText::Unfit(
+        "ship.url" if !ros2probe_ship::is_destination(text) => Err(InvalidText::Unsuitable(
             "a destination, as in `s3://bucket/prefix`, `gs://bucket`, `az://container` or \
              `file:///mnt/bags`",
         )),
-        "ship.endpoint" if remote_write::receiver(text).is_none() => Err(InvalidText::Unfit(
+        "ship.endpoint" if remote_write::receiver(text).is_none() => Err(InvalidText::Unsuitable(
             "the URL of a store, as in `https://minio.example:9000`",
         )),
-        "ship.instance" if text.is_empty() || text.len() > 128 => Err(InvalidText::Unfit(
+        "ship.instance" if text.is_empty() || text.len() > 128 => Err(InvalidText::Unsuitable(
             "the name of a robot, in at most 128 bytes",
         )),
         "ship.credentials_file" | "ship.ca_file" if !text.starts_with('/') => {
@@ -645,7 +649,7 @@ pub(super) fn check_text(key: &str, text: &str) -> Result<(), InvalidText> {
         }
         "ship.windows[]" => match text.parse::<Window>() {
             Ok(_) => Ok(()),
-            Err(_) => Err(InvalidText::Unfit(
+            Err(_) => Err(InvalidText::Unsuitable(
                 "two times of the day, as in `22:00-06:00`",
             )),
         },
@@ -706,7 +710,8 @@ fn without_indices(key: &str) -> String {
     key.chars().filter(|c| shown(*c)).collect()
 }
 
-/// Returns the settings of a delivery; texts that are no windows are reported by the check of texts.
+/// Returns the settings of a delivery; texts that are no windows are reported by the check of
+/// texts.
 fn ship(shape: ShipShape) -> ShipSettings {
     let windows = shape.windows.unwrap_or_default();
     let windows = windows.iter().filter_map(|text| text.parse().ok());

@@ -47,7 +47,7 @@ pub struct Mistakes(Vec<Mistake>);
 
 impl Mistakes {
     /// Maximum number of mistakes printed.
-    const SHOWN: usize = 50;
+    const MAX_SHOWN: usize = 50;
 
     /// Adds a mistake.
     pub fn add(&mut self, position: Position, key: &str, message: impl Into<String>) {
@@ -89,13 +89,13 @@ impl Mistakes {
         let mut lines: Vec<String> = self
             .0
             .iter()
-            .take(Self::SHOWN)
+            .take(Self::MAX_SHOWN)
             .map(|mistake| format!("{file}:{mistake}"))
             .collect();
         if let Some(more) = self
             .0
             .len()
-            .checked_sub(Self::SHOWN)
+            .checked_sub(Self::MAX_SHOWN)
             .filter(|more| *more > 0)
         {
             lines.push(format!("{file}: and {more} more"));

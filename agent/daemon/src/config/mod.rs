@@ -276,7 +276,7 @@ impl Default for RecordingLimits {
 impl RecordingSettings {
     /// Returns whether the bags are in the directory of saved state.
     #[must_use]
-    pub fn is_in(&self, state: &StateChoice) -> bool {
+    pub fn is_in_state_directory(&self, state: &StateChoice) -> bool {
         self.directory == StateChoice::Auto && *state != StateChoice::Off
     }
 }

@@ -17,7 +17,7 @@ use ros2probe_metrics::series_name::series_name;
 use ros2probe_model::derive::clocks;
 use ros2probe_model::facts::churn;
 use ros2probe_model::facts::diagnosis::{Diagnosis, Policy};
-use ros2probe_model::facts::event::{EventKind, LossBurst, bounded};
+use ros2probe_model::facts::event::{EventKind, LossBurst, truncated};
 use ros2probe_model::facts::naming::Naming;
 use ros2probe_model::facts::shared_memory::MemoryFault;
 use ros2probe_model::report::snapshot::WatchState;
@@ -197,7 +197,7 @@ impl Occurrence {
             _ => false,
         };
         if relieves {
-            definition.relief
+            definition.resolved_severity
         } else {
             definition.severity
         }
@@ -484,12 +484,12 @@ fn finding(finding: &Diagnosis) -> Values {
             domain_id,
             node,
             errors,
-            text: said,
+            text: log_text,
         } => vec![
             ("domain_id", number(*domain_id)),
             ("ros_node", Some(text(node))),
             ("log_errors", number(*errors)),
-            ("log_text", Some(text(said))),
+            ("log_text", Some(text(log_text))),
         ],
         Diagnosis::DiagnosticError {
             domain_id,
@@ -764,12 +764,12 @@ fn series<'a>(naming: Option<&'a Naming>, topic: &'a str) -> Cow<'a, str> {
 
 fn list<T: Display>(items: impl IntoIterator<Item = T>) -> Option<Value> {
     let items = items.into_iter();
-    let texts = items.map(|item| bounded(&item.to_string()).to_owned());
+    let texts = items.map(|item| truncated(&item.to_string()).to_owned());
     Some(Value::List(texts.collect()))
 }
 
 fn text(text: &str) -> Value {
-    Value::Text(bounded(text).to_owned())
+    Value::Text(truncated(text).to_owned())
 }
 
 fn written(value: &impl Display) -> Option<Value> {

@@ -8,7 +8,7 @@ use crate::agent_facts::AgentFacts;
 use crate::snapshot_cell::Unready;
 
 /// Minimum time between two reports of losses.
-const PAUSE: Duration = Duration::from_secs(1);
+const MIN_REPORT_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Detects losses of packets and records before they reach the model.
 #[derive(Debug, Default)]
@@ -25,13 +25,13 @@ pub struct SourceMonitor {
     blind_since: Option<Instant>,
     /// Time of the last successful check. Before the first one, the agent is starting, not blind.
     saw: Option<Instant>,
-    attached_anew: u64,
+    reattachments: u64,
 }
 
 impl DropMonitor {
     /// Returns events about losses since the last report.
     pub fn check(&mut self, facts: &AgentFacts, now: Instant) -> Vec<AgentEvent> {
-        let early = |at: Instant| now.saturating_duration_since(at) < PAUSE;
+        let early = |at: Instant| now.saturating_duration_since(at) < MIN_REPORT_INTERVAL;
         if self.at.is_some_and(early) {
             return Vec::new();
         }
@@ -65,7 +65,7 @@ fn losses(facts: &AgentFacts) -> Losses {
 
 impl SourceMonitor {
     /// Returns events about changes of visibility at `now`. `ready` has the reason of a failure,
-    /// and `attached_anew` the number of times the hook was attached again. If a control group was
+    /// and `reattachments` the number of times the hook was attached again. If a control group was
     /// recreated between two checks, both events are returned, with the time between the checks.
     pub fn check(
         &mut self,
@@ -73,7 +73,7 @@ impl SourceMonitor {
         attached_anew: u64,
         now: Instant,
     ) -> Vec<AgentEvent> {
-        let is_anew = attached_anew > std::mem::replace(&mut self.attached_anew, attached_anew);
+        let is_anew = attached_anew > std::mem::replace(&mut self.reattachments, attached_anew);
         let mut events = Vec::new();
         match ready {
             Ok(()) => {

@@ -106,7 +106,7 @@ pub(super) const PARTICIPANT_LOST: Definition = Definition::new(
     PARTICIPANT_GONE,
     "A participant left: its lease expired, or (INFO) it disposed of itself.",
 )
-.relief(Severity::Info);
+.resolved_severity(Severity::Info);
 pub(super) const ENDPOINT_DISCOVERED: Definition = Definition::new(
     "ros2.endpoint.discovered",
     Severity::Info,
@@ -144,7 +144,7 @@ pub(super) const LIFECYCLE_TRANSITION: Definition = Definition::new(
     "A managed node changed its lifecycle state; WARN if it is errorprocessing now. The process is \
      known with capture.inside.",
 )
-.relief(Severity::Info);
+.resolved_severity(Severity::Info);
 pub(super) const DIAGNOSTIC_CHANGED: Definition = Definition::new(
     "ros2.robot.diagnostic_changed",
     Severity::Warn,
@@ -161,7 +161,7 @@ pub(super) const DIAGNOSTIC_CHANGED: Definition = Definition::new(
     "A part of the robot has another level in its diagnostics, or ceased to publish them (`stale`); \
      INFO if it is `ok` now.",
 )
-.relief(Severity::Info);
+.resolved_severity(Severity::Info);
 pub(super) const TRANSFORM_JUMPED: Definition = Definition::new(
     "ros2.robot.transform_jumped",
     Severity::Warn,
@@ -211,7 +211,7 @@ pub(super) const EXPECTATION_CHANGED: Definition = Definition::new(
     &["domain_id", "topic", "watch", "from", "to", "violations"],
     "The state of a watched topic changed; INFO if it is ok now.",
 )
-.relief(Severity::Info);
+.resolved_severity(Severity::Info);
 pub(super) const TOPIC_SILENT: Definition = Definition::new(
     "ros2.topic.silent",
     Severity::Warn,
@@ -240,7 +240,7 @@ pub(super) const GRAPH_DIAGNOSED: Definition = Definition::new(
      shared_machine_id, lossy_link, log_errors, diagnostic_error, transform_fault, clocks_apart, slow_chain, or (INFO) unmatched_publisher, unmatched_subscription, \
      restamping_node, buffers_by_cpu.",
 )
-.relief(Severity::Info);
+.resolved_severity(Severity::Info);
 pub(super) const GRAPH_RESOLVED: Definition = Definition::new(
     "ros2.graph.resolved",
     Severity::Info,
@@ -309,7 +309,7 @@ pub(super) const RECORDING_ENDED: Definition = Definition::new(
     &["recording", "messages", "missing", "reason"],
     "A bag is complete; with a reason if the storage failed.",
 )
-.relief(Severity::Info);
+.resolved_severity(Severity::Info);
 pub(super) const SNAPSHOT_TAKEN: Definition = Definition::new(
     "ros2probe.snapshot.taken",
     Severity::Error,
@@ -324,7 +324,7 @@ pub(super) const SNAPSHOT_TAKEN: Definition = Definition::new(
     "The messages around an incident are in a bag; with a reason if writing failed. `trigger` is \
      that of the configuration, `request` or `signal`.",
 )
-.relief(Severity::Info);
+.resolved_severity(Severity::Info);
 pub(super) const WATCH_ADDED: Definition = Definition::new(
     "ros2probe.watch.added",
     Severity::Info,

@@ -103,7 +103,7 @@ fn a_lifecycle_transition_is_a_warning_only_on_an_error() {
 #[test]
 fn a_burst_is_limited_each_second_and_summarized_in_one_event() {
     let log = EventLog::new();
-    let storm = u64::from(MOST) + 50;
+    let storm = u64::from(MAX_EVENTS_PER_SECOND) + 50;
     log.add(taken((0..storm).map(node).collect()), second(0));
     let other = Event {
         kind: EventKind::Silence {
@@ -118,7 +118,10 @@ fn a_burst_is_limited_each_second_and_summarized_in_one_event() {
     more.overflow = vec![(Class::Endpoint, 9)];
     log.add(more, second(1));
     let batch = log.read(0, KeptEvents::CAP);
-    assert_eq!(batch.records.len() as u64, u64::from(MOST) + 1);
+    assert_eq!(
+        batch.records.len() as u64,
+        u64::from(MAX_EVENTS_PER_SECOND) + 1
+    );
     assert_eq!(names(&batch).last(), Some(&"ros2.topic.silent"));
     log.add(Taken::default(), second(1));
     assert_eq!(log.last(), batch.last);
@@ -130,13 +133,13 @@ fn a_burst_is_limited_each_second_and_summarized_in_one_event() {
         names(&rest),
         [suppressed, suppressed, "ros2.node.discovered"]
     );
-    let said: Vec<_> = rest.records[..2]
+    let recorded: Vec<_> = rest.records[..2]
         .iter()
         .map(|record| record.attributes.clone())
         .collect();
     let text = |text: &str| Value::Text(text.to_owned());
     assert_eq!(
-        said,
+        recorded,
         [
             [
                 ("event", text("ros2.endpoint.*")),
@@ -150,7 +153,10 @@ fn a_burst_is_limited_each_second_and_summarized_in_one_event() {
     );
     assert_eq!(log.dropped()[0], ("storm", 60));
     let recorded: BTreeMap<_, _> = log.recorded().into_iter().collect();
-    assert_eq!(recorded["ros2.node.discovered"], u64::from(MOST) + 1);
+    assert_eq!(
+        recorded["ros2.node.discovered"],
+        u64::from(MAX_EVENTS_PER_SECOND) + 1
+    );
     assert_eq!(
         (recorded[suppressed], recorded["ros2.message.lost"]),
         (2, 0)
@@ -160,13 +166,13 @@ fn a_burst_is_limited_each_second_and_summarized_in_one_event() {
 #[test]
 fn a_burst_of_agent_events_is_limited_by_the_clock_of_the_agent() {
     let log = EventLog::new();
-    let at = |seconds| log.begun + Duration::from_secs(seconds);
-    for _ in 0..MOST + 3 {
+    let at = |seconds| log.started + Duration::from_secs(seconds);
+    for _ in 0..MAX_EVENTS_PER_SECOND + 3 {
         log.record_at(AgentEvent::Reloaded { watches: 1 }, at(1));
     }
-    assert_eq!(log.last(), u64::from(MOST));
+    assert_eq!(log.last(), u64::from(MAX_EVENTS_PER_SECOND));
     log.record_at(AgentEvent::Reloaded { watches: 1 }, at(2));
-    let rest = log.read(MOST.into(), 10);
+    let rest = log.read(MAX_EVENTS_PER_SECOND.into(), 10);
     assert_eq!(names(&rest)[0], "ros2probe.events.suppressed");
     assert_eq!(rest.records.len(), 2);
 }
@@ -208,7 +214,7 @@ fn overwritten_events_are_reported_to_the_reader_that_missed_them() {
     assert_eq!(batch.records.len(), KeptEvents::CAP);
     crate::tables::tests::assert_driven::<KeptEvents>();
     assert_eq!(log.read(4000, 1).lagged, 0);
-    log.overtook(Reader::Otlp, lost);
+    log.count_overwritten(Reader::Otlp, lost);
     assert!(log.dropped().contains(&("otlp_lagged", lost)));
     // An impossible position returns no events.
     assert_eq!(log.read(u64::MAX, 1).records.len(), 0);
@@ -243,7 +249,7 @@ async fn a_waiting_reader_is_woken_by_the_next_event() {
 }
 
 /// Waits briefly for a future.
-trait Soon: Future + Sized {
+trait AwaitSoon: Future + Sized {
     async fn await_soon(self, expected: bool) {
         let timeout = Duration::from_millis(if expected { 10_000 } else { 20 });
         let came = tokio::time::timeout(timeout, self).await.is_ok();
@@ -251,4 +257,4 @@ trait Soon: Future + Sized {
     }
 }
 
-impl<F: Future> Soon for F {}
+impl<F: Future> AwaitSoon for F {}

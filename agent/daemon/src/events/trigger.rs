@@ -6,7 +6,7 @@ use super::table::{self, EVENTS};
 use ros2probe_metrics::event::{Definition, Record, Severity, Value};
 
 /// Short names of triggers, with the event that reports each problem.
-const PROBLEMS: [(&str, &Definition); 5] = [
+const TRIGGER_NAMES: [(&str, &Definition); 5] = [
     ("expectation", &table::EXPECTATION_CHANGED),
     ("message_lost", &table::MESSAGE_LOST),
     ("participant_lost", &table::PARTICIPANT_LOST),
@@ -36,7 +36,7 @@ impl Trigger {
     /// an event about snapshots, which would trigger itself.
     #[must_use]
     pub fn parse(name: &str) -> Option<Self> {
-        if let Some((name, event)) = PROBLEMS.iter().find(|(known, _)| *known == name) {
+        if let Some((name, event)) = TRIGGER_NAMES.iter().find(|(known, _)| *known == name) {
             let condition = Condition::Problem(event.name);
             return Some(Self { name, condition });
         }
@@ -56,8 +56,8 @@ impl Trigger {
 
     /// Returns the names of all triggers: short names, kinds of findings, events.
     pub fn names() -> impl Iterator<Item = &'static str> {
-        let problems = PROBLEMS.iter().map(|(name, _)| *name);
-        let is_short = |kind: &&str| !PROBLEMS.iter().any(|(name, _)| name == kind);
+        let problems = TRIGGER_NAMES.iter().map(|(name, _)| *name);
+        let is_short = |kind: &&str| !TRIGGER_NAMES.iter().any(|(name, _)| name == kind);
         let findings = Diagnosis::KINDS.into_iter().filter(is_short);
         let events = EVENTS.iter().map(|event| event.name);
         let events = events.filter(|name| *name != table::SNAPSHOT_TAKEN.name);

@@ -13,13 +13,13 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 /// Bytes that a ready pipe accepts without blocking (`PIPE_BUF`).
-const PIECE: usize = 4096;
+const PIPE_BUF: usize = 4096;
 /// Maximum time to wait for a reader that has kept up so far.
-const TIMEOUT: Timespec = Timespec {
+const READER_TIMEOUT: Timespec = Timespec {
     tv_sec: 0,
     tv_nsec: 100_000_000,
 };
-const NONE: Timespec = Timespec {
+const NO_WAIT: Timespec = Timespec {
     tv_sec: 0,
     tv_nsec: 0,
 };
@@ -32,9 +32,9 @@ pub(super) struct Lines<W> {
     /// Dropped lines that are not reported yet.
     unreported: u64,
     /// Whether the last line was dropped; the next one then does not wait.
-    is_stuck: bool,
+    is_blocked: bool,
     /// Whether a line was written in part.
-    is_cut: bool,
+    is_truncated: bool,
 }
 
 impl<W: Write + AsFd> Lines<W> {
@@ -43,27 +43,27 @@ impl<W: Write + AsFd> Lines<W> {
             target,
             lost,
             unreported: 0,
-            is_stuck: false,
-            is_cut: false,
+            is_blocked: false,
+            is_truncated: false,
         }
     }
 
     /// Writes a line as far as possible without blocking.
     fn line(&mut self, line: &[u8]) -> io::Result<()> {
-        for piece in line.chunks(PIECE) {
-            self.ready()?;
+        for piece in line.chunks(PIPE_BUF) {
+            self.wait_writable()?;
             self.target.write_all(piece)?;
-            self.is_cut = !piece.ends_with(b"\n");
+            self.is_truncated = !piece.ends_with(b"\n");
         }
         Ok(())
     }
 
     /// Ends a truncated line, and reports dropped lines before the next one.
-    fn catch_up(&mut self) -> io::Result<()> {
+    fn finish_truncated(&mut self) -> io::Result<()> {
         if self.unreported == 0 {
             return Ok(());
         }
-        let begin = if self.is_cut { "\n" } else { "" };
+        let begin = if self.is_truncated { "\n" } else { "" };
         let text = format!(
             "{begin}{} lines of the log were lost here\n",
             self.unreported
@@ -73,8 +73,12 @@ impl<W: Write + AsFd> Lines<W> {
         Ok(())
     }
 
-    fn ready(&self) -> io::Result<()> {
-        let timeout = if self.is_stuck { NONE } else { TIMEOUT };
+    fn wait_writable(&self) -> io::Result<()> {
+        let timeout = if self.is_blocked {
+            NO_WAIT
+        } else {
+            READER_TIMEOUT
+        };
         let mut target = [PollFd::new(&self.target, PollFlags::OUT)];
         // A descriptor after a hangup is ready, too; the write then fails.
         match poll(&mut target, Some(&timeout)) {
@@ -88,9 +92,9 @@ impl<W: Write + AsFd> Lines<W> {
 impl<W: Write + AsFd> Write for Lines<W> {
     /// Writes a line. A dropped line is not an error.
     fn write(&mut self, line: &[u8]) -> io::Result<usize> {
-        let written = self.catch_up().and_then(|()| self.line(line));
-        self.is_stuck = written.is_err();
-        if self.is_stuck {
+        let written = self.finish_truncated().and_then(|()| self.line(line));
+        self.is_blocked = written.is_err();
+        if self.is_blocked {
             self.unreported += 1;
             self.lost.fetch_add(1, Ordering::Relaxed);
         }

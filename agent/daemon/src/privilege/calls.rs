@@ -20,7 +20,7 @@ use super::Role;
 pub enum FilterError {
     /// The filter cannot be built.
     #[error(transparent)]
-    Made(#[from] BackendError),
+    Build(#[from] BackendError),
     /// The kernel does not support filters, or not for this process.
     #[error("{0}")]
     Refused(String),
@@ -35,7 +35,7 @@ pub(super) fn load(role: Role) -> Result<(), FilterError> {
 /// Builds the program of a role's filter.
 fn program(role: Role) -> Result<BpfProgram, BackendError> {
     let filter = SeccompFilter::new(
-        Allowed::to(role)?.0,
+        Allowed::for_role(role)?.0,
         SeccompAction::Errno(libc::EPERM.cast_unsigned()),
         SeccompAction::Allow,
         std::env::consts::ARCH.try_into()?,
@@ -77,7 +77,7 @@ fn absent() -> BpfProgram {
 }
 
 /// Calls of every thread: memory, locks, time, I/O on open files, exit.
-const EVERYWHERE: &[c_long] = &[
+const BASIC_CALLS: &[c_long] = &[
     libc::SYS_brk,
     libc::SYS_capget,
     libc::SYS_clock_getres,
@@ -126,7 +126,7 @@ const EVERYWHERE: &[c_long] = &[
 ];
 
 /// Calls that read file metadata and directories; opening files is allowed separately.
-const LOOK: &[c_long] = &[
+const READ_METADATA: &[c_long] = &[
     libc::SYS_faccessat,
     libc::SYS_faccessat2,
     libc::SYS_fadvise64,
@@ -147,7 +147,7 @@ const LOOK: &[c_long] = &[
 ];
 
 /// Calls that change files, for state and recordings.
-const CHANGE: &[c_long] = &[
+const CHANGE_FILES: &[c_long] = &[
     libc::SYS_copy_file_range,
     libc::SYS_fallocate,
     libc::SYS_fchmod,
@@ -207,7 +207,7 @@ const RESOLVE: &[c_long] = &[libc::SYS_bind, libc::SYS_recvmmsg, libc::SYS_sendm
 const LISTEN: &[c_long] = &[libc::SYS_bind, libc::SYS_listen];
 
 /// Calls of inotify.
-const NOTICE: &[c_long] = &[
+const INOTIFY_CALLS: &[c_long] = &[
     libc::SYS_inotify_add_watch,
     libc::SYS_inotify_init1,
     libc::SYS_inotify_rm_watch,
@@ -237,9 +237,9 @@ mod request {
 struct Allowed(BTreeMap<c_long, Vec<SeccompRule>>);
 
 impl Allowed {
-    fn to(role: Role) -> Result<Self, BackendError> {
+    fn for_role(role: Role) -> Result<Self, BackendError> {
         let mut allowed = Self::default();
-        allowed.always(EVERYWHERE).everywhere()?;
+        allowed.allow(BASIC_CALLS).everywhere()?;
         match role {
             Role::Serve => allowed.serve()?,
             Role::Service => allowed.service()?,
@@ -250,32 +250,39 @@ impl Allowed {
                         allowed.socket(family, kind)?;
                     }
                 }
-                allowed.always(RESOLVE);
+                allowed.allow(RESOLVE);
             }
             Role::Ros2Daemon => {
-                allowed.always(LOOK).open_for_reading()?;
-                allowed.always(SERVE).always(LISTEN).connections()?;
+                allowed.allow(READ_METADATA).open_for_reading()?;
+                allowed.allow(SERVE).allow(LISTEN).connections()?;
                 allowed.socket(libc::AF_INET, libc::SOCK_STREAM)?;
             }
             Role::Capture { .. } => {
-                allowed.always(LOOK).open_for_reading()?;
-                allowed.always(&[libc::SYS_getsockopt, libc::SYS_recvmsg, libc::SYS_recvfrom]);
+                allowed.allow(READ_METADATA).open_for_reading()?;
+                allowed.allow(&[libc::SYS_getsockopt, libc::SYS_recvmsg, libc::SYS_recvfrom]);
                 let commands = command::MAPS.into_iter();
                 allowed.bpf(commands.chain([command::ITERATOR_CREATE]))?;
                 allowed.end_perf_events()?;
             }
             Role::Reattach { .. } => {
-                allowed.always(LOOK).always(NOTICE).open_for_reading()?;
+                allowed
+                    .allow(READ_METADATA)
+                    .allow(INOTIFY_CALLS)
+                    .open_for_reading()?;
                 allowed.bpf([command::LINK_CREATE].into_iter())?;
             }
             Role::SharedMemory { .. } => {
-                allowed.always(LOOK).always(NOTICE).open_for_reading()?;
+                allowed
+                    .allow(READ_METADATA)
+                    .allow(INOTIFY_CALLS)
+                    .open_for_reading()?;
                 for policy in [libc::SCHED_FIFO, libc::SCHED_OTHER] {
-                    allowed.when(libc::SYS_sched_setscheduler, &[equal(1, policy)?])?;
+                    allowed
+                        .allow_if(libc::SYS_sched_setscheduler, &[argument_equals(1, policy)?])?;
                 }
             }
             Role::Exact => {
-                allowed.always(NOTICE);
+                allowed.allow(INOTIFY_CALLS);
                 allowed.ask_broker()?;
             }
             Role::Inside { .. } => {
@@ -291,16 +298,16 @@ impl Allowed {
 
     /// Allows requests to the broker over a unix socket, and reading libraries' directories.
     fn ask_broker(&mut self) -> Result<(), BackendError> {
-        self.always(LOOK).open_for_reading()?;
-        self.always(&[libc::SYS_connect, libc::SYS_recvmsg, libc::SYS_sendmsg]);
-        self.always(&[libc::SYS_setsockopt]);
+        self.allow(READ_METADATA).open_for_reading()?;
+        self.allow(&[libc::SYS_connect, libc::SYS_recvmsg, libc::SYS_sendmsg]);
+        self.allow(&[libc::SYS_setsockopt]);
         self.socket(libc::AF_UNIX, libc::SOCK_SEQPACKET)
     }
 
     /// Allows the calls of the broker, which answers each request in a fork and attaches programs
     /// there.
     fn answer_agents(&mut self) -> Result<(), BackendError> {
-        self.always(LOOK).open_for_reading()?;
+        self.allow(READ_METADATA).open_for_reading()?;
         let spaces = [
             libc::CLONE_NEWUSER,
             libc::CLONE_NEWNS,
@@ -311,9 +318,9 @@ impl Allowed {
             libc::CLONE_NEWCGROUP,
         ];
         let spaces = spaces.into_iter().fold(0, |all, one| all | one);
-        let plain = condition(0, SeccompCmpOp::MaskedEq(wide(spaces)), 0)?;
-        self.when(libc::SYS_clone, &[plain])?;
-        self.always(&[
+        let plain = condition(0, SeccompCmpOp::MaskedEq(sign_extended(spaces)), 0)?;
+        self.allow_if(libc::SYS_clone, &[plain])?;
+        self.allow(&[
             libc::SYS_accept4,
             libc::SYS_getsockopt,
             libc::SYS_kill,
@@ -326,14 +333,17 @@ impl Allowed {
             libc::SYS_fork,
         ]);
         self.bpf([command::LINK_CREATE].into_iter())?;
-        self.when(libc::SYS_prctl, &[equal(0, libc::PR_SET_PDEATHSIG)?])?;
+        self.allow_if(
+            libc::SYS_prctl,
+            &[argument_equals(0, libc::PR_SET_PDEATHSIG)?],
+        )?;
         for request in [request::PERF_ENABLE, request::PERF_SET_BPF] {
-            self.when(libc::SYS_ioctl, &[equal(1, request)?])?;
+            self.allow_if(libc::SYS_ioctl, &[argument_equals(1, request)?])?;
         }
         Ok(())
     }
 
-    fn always(&mut self, calls: &[c_long]) -> &mut Self {
+    fn allow(&mut self, calls: &[c_long]) -> &mut Self {
         for call in calls {
             self.0.insert(*call, Vec::new());
         }
@@ -341,7 +351,11 @@ impl Allowed {
     }
 
     /// Allows `call` if all `conditions` hold.
-    fn when(&mut self, call: c_long, conditions: &[SeccompCondition]) -> Result<(), BackendError> {
+    fn allow_if(
+        &mut self,
+        call: c_long,
+        conditions: &[SeccompCondition],
+    ) -> Result<(), BackendError> {
         let rule = SeccompRule::new(conditions.to_vec())?;
         self.0.entry(call).or_default().push(rule);
         Ok(())
@@ -350,29 +364,32 @@ impl Allowed {
     fn everywhere(&mut self) -> Result<(), BackendError> {
         let process = i32::try_from(std::process::id()).unwrap_or(i32::MAX);
         for call in [libc::SYS_mmap, libc::SYS_mprotect] {
-            self.when(call, &[without(2, libc::PROT_EXEC)?])?;
+            self.allow_if(call, &[argument_lacks(2, libc::PROT_EXEC)?])?;
         }
         // abort() sends a signal to its own process.
-        self.when(libc::SYS_tgkill, &[equal(0, process)?])?;
+        self.allow_if(libc::SYS_tgkill, &[argument_equals(0, process)?])?;
         let named_or_read = [
             libc::PR_SET_NAME,
             libc::PR_GET_NO_NEW_PRIVS,
             libc::PR_CAPBSET_READ,
         ];
         for option in named_or_read {
-            self.when(libc::SYS_prctl, &[equal(0, option)?])?;
+            self.allow_if(libc::SYS_prctl, &[argument_equals(0, option)?])?;
         }
-        let is_set = equal(1, libc::PR_CAP_AMBIENT_IS_SET)?;
-        self.when(libc::SYS_prctl, &[equal(0, libc::PR_CAP_AMBIENT)?, is_set])?;
+        let is_set = argument_equals(1, libc::PR_CAP_AMBIENT_IS_SET)?;
+        self.allow_if(
+            libc::SYS_prctl,
+            &[argument_equals(0, libc::PR_CAP_AMBIENT)?, is_set],
+        )?;
         // Any thread may handle a signal, and notifies the runtime through an open socket.
-        self.when(libc::SYS_sendto, &[condition(4, SeccompCmpOp::Eq, 0)?])?;
+        self.allow_if(libc::SYS_sendto, &[condition(4, SeccompCmpOp::Eq, 0)?])?;
         // Resource limits are only read.
-        self.when(libc::SYS_prlimit64, &[condition(2, SeccompCmpOp::Eq, 0)?])
+        self.allow_if(libc::SYS_prlimit64, &[condition(2, SeccompCmpOp::Eq, 0)?])
     }
 
     fn service(&mut self) -> Result<(), BackendError> {
         self.serve()?;
-        self.always(CONNECT);
+        self.allow(CONNECT);
         for kind in [libc::SOCK_STREAM, libc::SOCK_DGRAM] {
             self.socket(libc::AF_UNIX, kind)?;
         }
@@ -380,62 +397,66 @@ impl Allowed {
     }
 
     fn serve(&mut self) -> Result<(), BackendError> {
-        self.always(LOOK).always(CHANGE).always(SERVE);
+        self.allow(READ_METADATA).allow(CHANGE_FILES).allow(SERVE);
         // Only threads may be created, without new processes or namespaces.
         let kinds =
             libc::CLONE_THREAD | libc::CLONE_NEWUSER | libc::CLONE_NEWNS | libc::CLONE_NEWNET;
-        let thread = SeccompCmpOp::MaskedEq(wide(kinds));
-        let thread = condition(0, thread, wide(libc::CLONE_THREAD))?;
-        self.when(libc::SYS_clone, &[thread])?;
+        let thread = SeccompCmpOp::MaskedEq(sign_extended(kinds));
+        let thread = condition(0, thread, sign_extended(libc::CLONE_THREAD))?;
+        self.allow_if(libc::SYS_clone, &[thread])?;
         self.connections()
     }
 
     /// Allows the calls that a runtime uses for its signals and connections.
     fn connections(&mut self) -> Result<(), BackendError> {
-        self.when(libc::SYS_socketpair, &[equal(0, libc::AF_UNIX)?])?;
+        self.allow_if(libc::SYS_socketpair, &[argument_equals(0, libc::AF_UNIX)?])?;
         for request in request::ORDINARY {
-            self.when(libc::SYS_ioctl, &[equal(1, request)?])?;
+            self.allow_if(libc::SYS_ioctl, &[argument_equals(1, request)?])?;
         }
         Ok(())
     }
 
     fn socket(&mut self, family: i32, kind: i32) -> Result<(), BackendError> {
         let flags = libc::SOCK_CLOEXEC | libc::SOCK_NONBLOCK;
-        let of_kind = SeccompCmpOp::MaskedEq(!wide(flags) & u64::from(u32::MAX));
-        let of_kind = SeccompCondition::new(1, SeccompCmpArgLen::Dword, of_kind, wide(kind))?;
-        self.when(libc::SYS_socket, &[equal(0, family)?, of_kind])
+        let of_kind = SeccompCmpOp::MaskedEq(!sign_extended(flags) & u64::from(u32::MAX));
+        let of_kind =
+            SeccompCondition::new(1, SeccompCmpArgLen::Dword, of_kind, sign_extended(kind))?;
+        self.allow_if(libc::SYS_socket, &[argument_equals(0, family)?, of_kind])
     }
 
     fn open_for_reading(&mut self) -> Result<(), BackendError> {
         // musl's O_ACCMODE contains O_PATH, which reads nothing.
         let changing = libc::O_WRONLY | libc::O_RDWR | libc::O_CREAT | libc::O_TRUNC;
         #[cfg(target_arch = "x86_64")]
-        self.when(libc::SYS_open, &[without(1, changing)?])?;
-        self.when(libc::SYS_openat, &[without(2, changing)?])
+        self.allow_if(libc::SYS_open, &[argument_lacks(1, changing)?])?;
+        self.allow_if(libc::SYS_openat, &[argument_lacks(2, changing)?])
     }
 
     fn bpf(&mut self, commands: impl Iterator<Item = libc::c_int>) -> Result<(), BackendError> {
         for command in commands {
-            self.when(libc::SYS_bpf, &[equal(0, command)?])?;
+            self.allow_if(libc::SYS_bpf, &[argument_equals(0, command)?])?;
         }
         Ok(())
     }
 
     /// Allows detaching tracepoints and probes.
     fn end_perf_events(&mut self) -> Result<(), BackendError> {
-        self.when(libc::SYS_ioctl, &[equal(1, request::PERF_DISABLE)?])
+        self.allow_if(
+            libc::SYS_ioctl,
+            &[argument_equals(1, request::PERF_DISABLE)?],
+        )
     }
 }
 
 /// Returns the condition that a 32-bit argument has this value.
-fn equal(argument: u8, value: i32) -> Result<SeccompCondition, BackendError> {
+fn argument_equals(argument: u8, value: i32) -> Result<SeccompCondition, BackendError> {
     let value = u64::from(value.cast_unsigned());
     SeccompCondition::new(argument, SeccompCmpArgLen::Dword, SeccompCmpOp::Eq, value)
 }
 
 /// Returns the condition that an argument has none of these bits.
-fn without(argument: u8, bits: i32) -> Result<SeccompCondition, BackendError> {
-    condition(argument, SeccompCmpOp::MaskedEq(wide(bits)), 0)
+fn argument_lacks(argument: u8, bits: i32) -> Result<SeccompCondition, BackendError> {
+    condition(argument, SeccompCmpOp::MaskedEq(sign_extended(bits)), 0)
 }
 
 fn condition(
@@ -446,7 +467,7 @@ fn condition(
     SeccompCondition::new(argument, SeccompCmpArgLen::Qword, comparison, value)
 }
 
-fn wide(bits: i32) -> u64 {
+fn sign_extended(bits: i32) -> u64 {
     u64::from(bits.cast_unsigned())
 }
 

@@ -15,14 +15,14 @@ use ros2probe_capture::container::{FAMILIES_LINE, is_container, is_service};
 /// Capabilities for attaching programs to a cgroup (`CAP_NET_ADMIN`), for loading them (`CAP_BPF`),
 /// and for tracepoints and iterators (`CAP_PERFMON`). `CAP_PERFMON` also skips Spectre barriers in
 /// the verifier, with which Linux 5.15 to 6.8 refuses the filter.
-const HOST: [CapabilitySet; 3] = [
+const HOST_CAPABILITIES: [CapabilitySet; 3] = [
     CapabilitySet::NET_ADMIN,
     CapabilitySet::BPF,
     CapabilitySet::PERFMON,
 ];
 
 /// Capabilities for packet sockets (`CAP_NET_RAW`); the others are as for the host's sockets.
-const WIRE: [CapabilitySet; 3] = [
+const WIRE_CAPABILITIES: [CapabilitySet; 3] = [
     CapabilitySet::NET_RAW,
     CapabilitySet::BPF,
     CapabilitySet::PERFMON,
@@ -123,11 +123,11 @@ fn candidates(settings: &CaptureSettings) -> Vec<(SourceChoice, Vec<CapabilitySe
     let named = !settings.include_interfaces.is_empty() || !settings.exclude_interfaces.is_empty();
     let mirrors = !settings.mirror_interfaces.is_empty();
     let entering = (!settings.network_namespaces.is_empty()).then_some(CapabilitySet::SYS_ADMIN);
-    let wire = || WIRE.into_iter().chain(entering).collect();
+    let wire = || WIRE_CAPABILITIES.into_iter().chain(entering).collect();
     let host = || {
         let packets = [Some(CapabilitySet::NET_RAW), entering];
         let packets = packets.into_iter().flatten().filter(|_| mirrors);
-        HOST.into_iter().chain(packets).collect()
+        HOST_CAPABILITIES.into_iter().chain(packets).collect()
     };
     match settings.source {
         SourceChoice::Host => vec![(SourceChoice::Host, host())],
@@ -211,7 +211,7 @@ impl Unprivileged {
 impl Missing {
     /// Returns a text about the capabilities that each source lacks.
     #[must_use]
-    pub fn needs(&self) -> String {
+    pub fn missing_text(&self) -> String {
         let needs: Vec<String> = self
             .sources
             .iter()
@@ -234,8 +234,8 @@ impl Missing {
         format!("sudo setcap {}+ep {program}", grant.join(","))
     }
 
-    /// Returns what grants the capabilities of the first possible source to a container, or why this
-    /// process does not have those of its container.
+    /// Returns what grants the capabilities of the first possible source to a container, or why
+    /// this process does not have those of its container.
     #[must_use]
     pub fn in_container(&self) -> String {
         let withheld = |one| capability_is_in_bounding_set(one).unwrap_or(false);
@@ -267,7 +267,7 @@ impl Missing {
     fn in_shell(&self) -> String {
         format!(
             "live capture needs {}: run `{}`, use sudo, or start the service ros2probe",
-            self.needs(),
+            self.missing_text(),
             self.command(),
         )
     }
@@ -289,7 +289,7 @@ impl Missing {
         format!(
             "live capture needs {}: the unit needs `AmbientCapabilities={names}`{more} \
              (`systemctl edit`)",
-            self.needs()
+            self.missing_text()
         )
     }
 }
@@ -336,17 +336,23 @@ mod tests {
     fn three_capabilities_are_enough_for_either_source() {
         let nothing: [Vec<CapabilitySet>; 0] = [];
         let auto = settings(SourceChoice::Auto);
-        assert_eq!(lacks(&HOST, &settings(SourceChoice::Host)), nothing);
-        assert_eq!(lacks(&WIRE, &settings(SourceChoice::Wire)), nothing);
-        assert_eq!(lacks(&HOST, &auto), nothing);
-        assert_eq!(lacks(&WIRE, &auto), nothing);
-        assert_eq!(lacks(&[], &auto), [HOST, WIRE]);
         assert_eq!(
-            lacks(&WIRE, &settings(SourceChoice::Host)),
+            lacks(&HOST_CAPABILITIES, &settings(SourceChoice::Host)),
+            nothing
+        );
+        assert_eq!(
+            lacks(&WIRE_CAPABILITIES, &settings(SourceChoice::Wire)),
+            nothing
+        );
+        assert_eq!(lacks(&HOST_CAPABILITIES, &auto), nothing);
+        assert_eq!(lacks(&WIRE_CAPABILITIES, &auto), nothing);
+        assert_eq!(lacks(&[], &auto), [HOST_CAPABILITIES, WIRE_CAPABILITIES]);
+        assert_eq!(
+            lacks(&WIRE_CAPABILITIES, &settings(SourceChoice::Host)),
             [[CapabilitySet::NET_ADMIN]]
         );
         assert_eq!(
-            lacks(&HOST, &settings(SourceChoice::Wire)),
+            lacks(&HOST_CAPABILITIES, &settings(SourceChoice::Wire)),
             [[CapabilitySet::NET_RAW]]
         );
     }
@@ -360,7 +366,7 @@ mod tests {
         let added: CapabilitySet = added
             .map(|name| CapabilitySet::from_name(name).unwrap())
             .collect();
-        assert_eq!(added, set(&HOST));
+        assert_eq!(added, set(&HOST_CAPABILITIES));
     }
 
     #[test]
@@ -369,17 +375,26 @@ mod tests {
             include_interfaces: vec!["eth0".to_owned()],
             ..settings(SourceChoice::Auto)
         };
-        assert_eq!(lacks(&HOST, &named), [[CapabilitySet::NET_RAW]]);
+        assert_eq!(
+            lacks(&HOST_CAPABILITIES, &named),
+            [[CapabilitySet::NET_RAW]]
+        );
         let mirroring = CaptureSettings {
             mirror_interfaces: vec!["mirror0".to_owned()],
             ..settings(SourceChoice::Host)
         };
-        assert_eq!(lacks(&HOST, &mirroring), [[CapabilitySet::NET_RAW]]);
+        assert_eq!(
+            lacks(&HOST_CAPABILITIES, &mirroring),
+            [[CapabilitySet::NET_RAW]]
+        );
         let entering = CaptureSettings {
             network_namespaces: vec![PathBuf::from("/run/netns/a")],
             ..settings(SourceChoice::Wire)
         };
-        assert_eq!(lacks(&WIRE, &entering), [[CapabilitySet::SYS_ADMIN]]);
+        assert_eq!(
+            lacks(&WIRE_CAPABILITIES, &entering),
+            [[CapabilitySet::SYS_ADMIN]]
+        );
         let old = [CapabilitySet::NET_RAW, CapabilitySet::SYS_ADMIN];
         assert!(lacks(&old, &entering).is_empty());
     }
@@ -411,14 +426,15 @@ mod tests {
 
     #[test]
     fn a_unit_gets_the_lines_that_grant_the_capabilities() {
-        let missing = missing(set(&HOST[1..]), &settings(SourceChoice::Host)).unwrap();
+        let missing = missing(set(&HOST_CAPABILITIES[1..]), &settings(SourceChoice::Host)).unwrap();
         assert_eq!(
             missing.in_unit(),
             "live capture needs CAP_NET_ADMIN for the source `host`: the unit needs \
              `AmbientCapabilities=CAP_NET_ADMIN CAP_BPF CAP_PERFMON` and \
              `CapabilityBoundingSet=CAP_NET_ADMIN CAP_BPF CAP_PERFMON` (`systemctl edit`)"
         );
-        let missing = super::missing(set(&WIRE[1..]), &settings(SourceChoice::Wire)).unwrap();
+        let missing =
+            super::missing(set(&WIRE_CAPABILITIES[1..]), &settings(SourceChoice::Wire)).unwrap();
         assert_eq!(
             missing.in_unit(),
             "live capture needs CAP_NET_RAW for the source `wire`: the unit needs \

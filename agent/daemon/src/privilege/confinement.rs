@@ -70,8 +70,9 @@ pub enum Role {
         /// Whether the kernel requires `CAP_BPF`, as [`Role::inside`] determines.
         needs_bpf: bool,
     },
-    /// The broker, a process of its own with the capabilities that [`uprobe::useful`] returns. It
-    /// forks, accepts connections, and opens files for reading, but creates no connection.
+    /// The broker, a process of its own with the capabilities that [`uprobe::usable_capabilities`]
+    /// returns. It forks, accepts connections, and opens files for reading, but creates no
+    /// connection.
     Broker,
 }
 
@@ -170,7 +171,7 @@ impl Role {
             Self::SharedMemory { needs_nice: true } => {
                 CapabilitySet::SYS_PTRACE | CapabilitySet::SYS_NICE
             }
-            Self::Broker => uprobe::useful(),
+            Self::Broker => uprobe::usable_capabilities(),
         }
     }
 }
@@ -183,7 +184,7 @@ impl Role {
 /// Fails if the kernel refuses to drop capabilities, which is not expected, or if the filter cannot
 /// be built.
 pub fn confine(role: Role) -> Result<(), ConfineError> {
-    give_up(role)?;
+    drop_capabilities(role)?;
     rustix::thread::set_no_new_privs(true).map_err(|error| ConfineError::Gain(error.into()))?;
     let sandbox = match calls::load(role) {
         Ok(()) => Sandbox::Filtered,
@@ -199,7 +200,7 @@ pub fn confine(role: Role) -> Result<(), ConfineError> {
 /// # Errors
 ///
 /// Fails if the kernel refuses, which is not expected for capabilities that the thread has.
-pub fn give_up(role: Role) -> Result<(), DropError> {
+pub fn drop_capabilities(role: Role) -> Result<(), DropError> {
     capabilities::keep(role.capabilities())
 }
 

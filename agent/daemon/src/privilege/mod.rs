@@ -17,8 +17,8 @@ pub use capabilities::{
     CapabilitiesRemain, DropError, Missing, Unprivileged, capability_names, check, missing, raise,
 };
 pub use confinement::{
-    ConfineError, Role, Sandbox, SpawnError, confine, give_up, sandbox, spawn, spawn_export,
-    spawn_source,
+    ConfineError, Role, Sandbox, SpawnError, confine, drop_capabilities, sandbox, spawn,
+    spawn_export, spawn_source,
 };
 pub use threads::{ThreadCapabilities, threads};
 pub use user::{Identity, become_own_user, user_id};

@@ -13,7 +13,7 @@ use rustix::thread::{
 use super::capabilities::capability_names;
 
 /// Name of the user and of the group.
-const NAME: &str = "ros2probe";
+const USER_NAME: &str = "ros2probe";
 
 /// User of the agent.
 #[derive(Debug, PartialEq, Eq)]
@@ -35,18 +35,18 @@ pub fn become_own_user() -> Identity {
     }
     let read = |path| fs::read_to_string(path).unwrap_or_default();
     let Some((user, group)) = find(&read("/etc/passwd"), &read("/etc/group")) else {
-        return Identity::Root(format!("user {NAME} does not exist"));
+        return Identity::Root(format!("user {USER_NAME} does not exist"));
     };
     let effective =
         capabilities(None).map_or_else(|_| CapabilitySet::empty(), |sets| sets.effective);
     let needed = [CapabilitySet::SETUID, CapabilitySet::SETGID];
     if let Some(missing) = needed.into_iter().find(|one| !effective.contains(*one)) {
         let missing = capability_names(missing).concat();
-        return Identity::Root(format!("switching to user {NAME} needs {missing}"));
+        return Identity::Root(format!("switching to user {USER_NAME} needs {missing}"));
     }
     match become_user(user, group) {
         Ok(()) => Identity::Own,
-        Err(error) => Identity::Root(format!("cannot switch to user {NAME}: {error}")),
+        Err(error) => Identity::Root(format!("cannot switch to user {USER_NAME}: {error}")),
     }
 }
 
@@ -55,7 +55,7 @@ pub fn become_own_user() -> Identity {
 fn find(users: &str, groups: &str) -> Option<(Uid, Gid)> {
     let line = |text: &str| -> Option<Vec<String>> {
         let mut lines = text.lines().map(|line| line.split(':'));
-        let found = lines.find(|fields| fields.clone().next() == Some(NAME))?;
+        let found = lines.find(|fields| fields.clone().next() == Some(USER_NAME))?;
         Some(found.map(str::to_owned).collect())
     };
     let number = |fields: &[String], index: usize| fields.get(index)?.parse::<u32>().ok();

@@ -11,7 +11,7 @@ use crate::config::RecordingLimits;
 use ros2probe_bag::Error;
 
 /// Bytes of messages between two checks of the file system.
-const STEP: u64 = 8 << 20;
+const CHECK_INTERVAL_BYTES: u64 = 8 << 20;
 
 /// Quota of one recording.
 #[derive(Clone, Debug)]
@@ -60,7 +60,7 @@ impl DiskQuota {
             return Err(QuotaExceeded::Bag(limit).into());
         }
         self.unseen = self.unseen.saturating_add(more);
-        if self.unseen >= STEP {
+        if self.unseen >= CHECK_INTERVAL_BYTES {
             self.unseen = 0;
             self.check()?;
         }
@@ -168,7 +168,7 @@ mod tests {
         std::fs::write(bags.join("before/before_0.mcap"), [0; 100]).unwrap();
         assert!(refused(quota(&bags, all).check()).contains("recordings.max_total_bytes"));
         let mut stepping = quota(&bags, all);
-        stepping.take(0, STEP - 1).unwrap();
+        stepping.take(0, CHECK_INTERVAL_BYTES - 1).unwrap();
         assert!(stepping.take(0, 1).is_err(), "after every few megabytes");
 
         let free = space(&bags).unwrap().free;

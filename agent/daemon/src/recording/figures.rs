@@ -27,7 +27,7 @@ pub struct SnapshotFigures {
     pub bytes: u64,
     /// Messages, and reports of missing ones, evicted before the end of the time span, for lack of
     /// memory.
-    pub crowded_out: u64,
+    pub evicted: u64,
     /// Bags written.
     pub written: u64,
     /// Bags that could not be written.

@@ -39,7 +39,7 @@ pub struct Filter {
     options: FilterOptions,
     regex: Option<Regex>,
     exclude_regex: Option<Regex>,
-    only: Option<HashSet<String>>,
+    names_in_selection: Option<HashSet<String>>,
 }
 
 /// Why options are invalid.
@@ -107,7 +107,7 @@ impl Filter {
             options,
             regex,
             exclude_regex,
-            only: None,
+            names_in_selection: None,
         })
     }
 
@@ -117,7 +117,8 @@ impl Filter {
         &self.options
     }
 
-    /// Returns the topics to subscribe to: all that [`Self::takes`] may accept, and a few others.
+    /// Returns the topics to subscribe to: all that [`Self::is_selected`] may accept, and a few
+    /// others.
     ///
     /// # Errors
     ///
@@ -146,7 +147,7 @@ impl Filter {
         Ok(Selection {
             include,
             exclude,
-            // Event topics of services are hidden; `takes` excludes other hidden topics.
+            // Event topics of services are hidden; `is_selected` excludes other hidden topics.
             hidden: options.include_hidden_topics
                 || options.all_services
                 || options.regex.is_some(),
@@ -191,22 +192,22 @@ impl Filter {
 
     /// Restricts the selection to these topics.
     #[must_use]
-    pub fn only(self, names: &[String]) -> Self {
+    pub fn restricted_to(self, names: &[String]) -> Self {
         Self {
-            only: Some(names.iter().cloned().collect()),
+            names_in_selection: Some(names.iter().cloned().collect()),
             ..self
         }
     }
 
     /// Returns whether `topic` is to be recorded.
     #[must_use]
-    pub fn takes(&self, topic: &Candidate<'_>) -> bool {
+    pub fn is_selected(&self, topic: &Candidate<'_>) -> bool {
         let options = &self.options;
         let found = |expression: &Option<Regex>, name: &str| {
             let expression = expression.as_ref();
             expression.is_some_and(|expression| expression.is_match(name.as_bytes()))
         };
-        let only = self.only.as_ref();
+        let only = self.names_in_selection.as_ref();
         if found(&self.exclude_regex, topic.name)
             || only.is_some_and(|only| !only.contains(topic.name))
         {
@@ -266,7 +267,7 @@ mod tests {
 
     fn takes(options: FilterOptions, name: &str) -> bool {
         let types = ["std_msgs/msg/String".to_owned()];
-        Filter::new(options).unwrap().takes(&Candidate {
+        Filter::new(options).unwrap().is_selected(&Candidate {
             name,
             types: &types,
             published: true,
@@ -352,7 +353,7 @@ mod tests {
                 published: false,
                 subscribed: false,
             };
-            Filter::new(options).unwrap().takes(&topic)
+            Filter::new(options).unwrap().is_selected(&topic)
         };
         assert!(!lonely(FilterOptions::everything()));
         let unpublished = FilterOptions {
@@ -410,9 +411,9 @@ mod tests {
             all.query(0, 1),
             "domain_id=0&queue_bytes=1&all=true&hidden=false"
         );
-        let only = all.only(&strings(&["/a"]));
+        let only = all.restricted_to(&strings(&["/a"]));
         let takes = |name| {
-            only.takes(&Candidate {
+            only.is_selected(&Candidate {
                 name,
                 types: &[],
                 published: true,

@@ -16,7 +16,7 @@ use crate::agent_facts::Ability;
 use crate::latched::latched;
 use crate::snapshot_cell::State;
 
-const VOLATILE: &str = "VOLATILE";
+const VOLATILE_DURABILITY: &str = "VOLATILE";
 
 /// The graph at one moment; a report compares two of them.
 #[derive(Clone, Debug, Default)]
@@ -107,11 +107,11 @@ impl From<&Topic<'_>> for PublishedTopic {
         let passages = passages.map(|each| (each.passage.as_ref(), each.pairs));
         let publishers = topic.publishers.iter();
         let durable_publishers =
-            publishers.filter(|publisher| publisher.qos.durability != VOLATILE);
+            publishers.filter(|publisher| publisher.qos.durability != VOLATILE_DURABILITY);
         Self {
             domain_id: topic.domain_id,
             name: topic.name.to_string(),
-            message_types: printed(&topic.message_types),
+            message_types: to_texts(&topic.message_types),
             subscribed: !topic.subscriptions.is_empty(),
             other_transport: other_transport(passages).map(str::to_owned),
             is_exact: topic
@@ -135,7 +135,7 @@ fn is_ros_topic(kind: &str) -> bool {
 }
 
 /// Returns each value as displayed text.
-fn printed<T: ToString>(texts: &[T]) -> Vec<String> {
+fn to_texts<T: ToString>(texts: &[T]) -> Vec<String> {
     texts.iter().map(ToString::to_string).collect()
 }
 
@@ -164,7 +164,7 @@ impl From<&TopicFacts> for PublishedTopic {
         Self {
             domain_id: facts.domain_id.0,
             name: facts.name.to_string(),
-            message_types: printed(&facts.message_types),
+            message_types: to_texts(&facts.message_types),
             subscribed: !facts.subscriptions.is_empty(),
             other_transport: other_transport(passages).map(str::to_owned),
             is_exact: false,
@@ -223,15 +223,15 @@ impl Publisher {
     /// repeated only to late joiners.
     #[must_use]
     pub fn is_durable(&self) -> bool {
-        self.qos.durability != VOLATILE
+        self.qos.durability != VOLATILE_DURABILITY
     }
 }
 
 impl From<&TopicFacts> for DiscoveredTopic {
     fn from(facts: &TopicFacts) -> Self {
         Self {
-            message_types: printed(&facts.message_types),
-            type_hashes: printed(&facts.type_hashes),
+            message_types: to_texts(&facts.message_types),
+            type_hashes: to_texts(&facts.type_hashes),
             publishers: facts.publishers.iter().map(Publisher::from).collect(),
             subscribed: !facts.subscriptions.is_empty(),
         }
@@ -241,8 +241,8 @@ impl From<&TopicFacts> for DiscoveredTopic {
 impl From<&Topic<'_>> for DiscoveredTopic {
     fn from(topic: &Topic<'_>) -> Self {
         Self {
-            message_types: printed(&topic.message_types),
-            type_hashes: printed(&topic.type_hashes),
+            message_types: to_texts(&topic.message_types),
+            type_hashes: to_texts(&topic.type_hashes),
             publishers: topic.publishers.iter().map(Publisher::from).collect(),
             subscribed: !topic.subscriptions.is_empty(),
         }

@@ -32,9 +32,9 @@ use ros2probe_model::report::snapshot::Transport;
 
 /// Interval of writes to the operating system, by the time of samples. A killed process loses at
 /// most one interval.
-const FLUSH: Duration = Duration::from_secs(1);
+const FLUSH_INTERVAL: Duration = Duration::from_secs(1);
 /// Interval of syncs to disk. A power failure loses at most one interval.
-const SYNC: Duration = Duration::from_secs(5);
+const SYNC_INTERVAL: Duration = Duration::from_secs(5);
 
 /// Sources of facts that samples do not contain.
 pub struct Sources<'a> {
@@ -161,7 +161,7 @@ impl<'a> Recorder<'a> {
 
     /// Keeps the last samples in memory, and writes them on [`Self::snapshot`].
     #[must_use]
-    pub fn waiting_in(self, ring: SampleRing) -> Self {
+    pub fn with_ring(self, ring: SampleRing) -> Self {
         Self {
             ring: Some(ring),
             ..self
@@ -170,7 +170,7 @@ impl<'a> Recorder<'a> {
 
     /// Makes the recording end with an error when the quota is exhausted.
     #[must_use]
-    pub fn within(self, quota: DiskQuota) -> Self {
+    pub fn with_quota(self, quota: DiskQuota) -> Self {
         Self {
             quota: Some(quota),
             ..self
@@ -197,11 +197,12 @@ impl<'a> Recorder<'a> {
     }
 
     /// Returns the selected and published topics of `graph` that have no message yet for a known
-    /// reason. The values are the reasons, as in [`Report::unobserved`].
+    /// reason. The values are the reasons, as in [`Report::unobserved_topics`].
     #[must_use]
-    pub fn unobserved(&self, graph: &GraphSnapshot) -> BTreeMap<String, String> {
+    pub fn unobserved_topics(&self, graph: &GraphSnapshot) -> BTreeMap<String, String> {
         let topics = graph.topics.iter();
-        let topics = topics.filter(|topic| topic.domain_id == self.domain_id && self.takes(topic));
+        let topics =
+            topics.filter(|topic| topic.domain_id == self.domain_id && self.is_selected(topic));
         let topics = topics.filter_map(|topic| {
             let recorded = self.report.topics.get(&topic.name);
             if recorded.is_some_and(|topic| topic.messages > 0 || topic.paused > 0) {
@@ -230,8 +231,8 @@ impl<'a> Recorder<'a> {
 
     /// Returns whether this topic would be recorded, regardless of its domain.
     #[must_use]
-    pub fn takes(&self, topic: &PublishedTopic) -> bool {
-        self.filter.takes(&Candidate {
+    pub fn is_selected(&self, topic: &PublishedTopic) -> bool {
+        self.filter.is_selected(&Candidate {
             name: &topic.name,
             types: &topic.message_types,
             published: true,
@@ -307,7 +308,7 @@ impl<'a> Recorder<'a> {
             let place = self.decide(name, message_type, None, &announced, false)?;
             // Other topics are decided again later, since they may be published or fit by then.
             if matches!(place, TopicDecision::Recorded(_)) {
-                self.keep(name, place);
+                self.store_decision(name, place);
             }
         }
         Ok(())
@@ -423,15 +424,15 @@ impl<'a> Recorder<'a> {
         if self.synced.0 == 0 {
             (self.flushed, self.synced) = (now, now);
         }
-        if now.distance(self.flushed) >= FLUSH
+        if now.distance(self.flushed) >= FLUSH_INTERVAL
             && let Some(quota) = &self.quota
         {
             quota.check()?;
         }
-        if now.distance(self.synced) >= SYNC {
+        if now.distance(self.synced) >= SYNC_INTERVAL {
             (self.flushed, self.synced) = (now, now);
             self.writer.sync()
-        } else if now.distance(self.flushed) >= FLUSH {
+        } else if now.distance(self.flushed) >= FLUSH_INTERVAL {
             self.flushed = now;
             self.writer.flush()
         } else {
@@ -462,7 +463,7 @@ impl<'a> Recorder<'a> {
                 self.report.no_room += messages;
                 return Ok(None);
             }
-            self.keep(name, place);
+            self.store_decision(name, place);
         }
         let Some(TopicDecision::Recorded(taken)) = self.topics.get_mut(&**name) else {
             return Ok(None);
@@ -484,17 +485,17 @@ impl<'a> Recorder<'a> {
 
     /// Stores the decision about a topic. Excluded topics take at most half of the table; beyond
     /// that, they are decided again each time.
-    fn keep(&mut self, name: &str, place: TopicDecision) {
+    fn store_decision(&mut self, name: &str, place: TopicDecision) {
         let bytes = match &place {
             TopicDecision::Recorded(taken) => name.len() + taken.description.type_name.len(),
             TopicDecision::Excluded | TopicDecision::NoRoom => name.len(),
         };
         let is_half_full = self.topics.len() >= RecordedTopics::CAP / 2
-            || self.names.room() < RecordedNames::CAP / 2;
+            || self.names.remaining() < RecordedNames::CAP / 2;
         if is_half_full && matches!(place, TopicDecision::Excluded) {
             return;
         }
-        if bytes > self.names.room() {
+        if bytes > self.names.remaining() {
             self.names.refuse();
         } else if self.topics.insert(name.to_owned(), place).is_none() {
             self.names.add(bytes);
@@ -535,14 +536,14 @@ impl<'a> Recorder<'a> {
             published: came || !announced.publishers.is_empty(),
             subscribed: announced.subscribed,
         };
-        if !self.filter.takes(&candidate) {
+        if !self.filter.is_selected(&candidate) {
             return Ok(TopicDecision::Excluded);
         }
         if self.topics.is_full() {
             self.topics.refuse();
             return Ok(TopicDecision::NoRoom);
         }
-        if name.len() + message_type.len() > self.names.room() {
+        if name.len() + message_type.len() > self.names.remaining() {
             self.names.refuse();
             return Ok(TopicDecision::NoRoom);
         }
@@ -553,7 +554,7 @@ impl<'a> Recorder<'a> {
             Some(offered) => offered.equivalence_hash.map(|hash| hash.to_string()),
             None => announced.publishers.first()?.equivalence_hash.clone(),
         });
-        let publishers = announced.publishers.iter().take(self.writers.room());
+        let publishers = announced.publishers.iter().take(self.writers.remaining());
         let mut offered: Vec<_> = publishers
             .map(|publisher| (publisher.guid.clone(), qos(&publisher.qos)))
             .collect();

@@ -8,7 +8,7 @@ use ros2probe_api::recording_report::{MissingRun, Report};
 use crate::subscriptions::{Missed, MissedReason};
 
 /// Maximum number of listed runs of missing samples; further runs are only counted.
-const RUNS: usize = 256;
+const MAX_LISTED_RUNS: usize = 256;
 /// Key of the report in the bag's custom data.
 pub(in crate::recording) const CUSTOM_DATA: &str = "ros2probe";
 
@@ -39,7 +39,7 @@ pub(super) fn add_missed(report: &mut Report, missed: &Missed) {
         MissedReason::QueueFull => (&mut topic.dropped, "dropped"),
     };
     *count += missed.samples;
-    if report.missing_runs.len() >= RUNS {
+    if report.missing_runs.len() >= MAX_LISTED_RUNS {
         report.missing_runs_unnamed += 1;
         return;
     }
@@ -119,16 +119,16 @@ mod tests {
     #[test]
     fn runs_beyond_the_maximum_are_counted_but_not_listed() {
         let mut report = Report::default();
-        for first in 0..RUNS as u64 + 5 {
+        for first in 0..MAX_LISTED_RUNS as u64 + 5 {
             add_missed(
                 &mut report,
                 &missed(first * 2 + 1, 1, MissedReason::Incomplete),
             );
         }
-        assert_eq!(report.missing_runs.len(), RUNS);
+        assert_eq!(report.missing_runs.len(), MAX_LISTED_RUNS);
         assert_eq!(
             (report.missing_runs_unnamed, report.missing),
-            (5, RUNS as u64 + 5)
+            (5, MAX_LISTED_RUNS as u64 + 5)
         );
     }
 

@@ -9,7 +9,7 @@ use ros2probe_wire::Timestamp;
 use ros2probe_model::facts::dispatch::Sample;
 
 /// Memory of a sample besides its payload, in bytes.
-const OVERHEAD: usize = 256;
+const SAMPLE_OVERHEAD: usize = 256;
 
 /// The last samples, oldest first.
 #[derive(Debug)]
@@ -19,7 +19,7 @@ pub struct SampleRing {
     limit: usize,
     span: Option<Duration>,
     /// Samples evicted before the end of the span, for lack of memory.
-    crowded_out: u64,
+    evicted: u64,
 }
 
 impl SampleRing {
@@ -31,7 +31,7 @@ impl SampleRing {
             bytes: 0,
             limit,
             span,
-            crowded_out: 0,
+            evicted: 0,
         }
     }
 
@@ -55,8 +55,8 @@ impl SampleRing {
 
     /// Returns the number of samples evicted before the end of the span, for lack of memory.
     #[must_use]
-    pub const fn crowded_out(&self) -> u64 {
-        self.crowded_out
+    pub const fn evicted(&self) -> u64 {
+        self.evicted
     }
 
     /// Adds a sample, and evicts the oldest ones if necessary.
@@ -66,7 +66,7 @@ impl SampleRing {
         self.samples.push_back(sample);
         self.evict(|sample, span| now - sample.time > span);
         while self.bytes > self.limit && self.pop().is_some() {
-            self.crowded_out += 1;
+            self.evicted += 1;
         }
     }
 
@@ -107,7 +107,7 @@ impl SampleRing {
 }
 
 fn cost(sample: &Sample) -> usize {
-    OVERHEAD + sample.payload.as_ref().map_or(0, bytes::Bytes::len)
+    SAMPLE_OVERHEAD + sample.payload.as_ref().map_or(0, bytes::Bytes::len)
 }
 
 #[cfg(test)]
@@ -152,7 +152,7 @@ mod tests {
         for second in 0..6 {
             ring.push(sample(second, 10));
         }
-        assert_eq!((ring.len(), ring.crowded_out()), (4, 0));
+        assert_eq!((ring.len(), ring.evicted()), (4, 0));
         ring.advance(Timestamp(7_000_000_000));
         assert_eq!(numbers(&mut ring), [4, 5]);
         assert!(ring.is_empty() && ring.bytes() == 0);
@@ -165,7 +165,7 @@ mod tests {
             ring.push(sample(second, 1000));
             assert!(ring.bytes() <= 3000);
         }
-        assert_eq!(ring.crowded_out(), 3);
+        assert_eq!(ring.evicted(), 3);
         assert_eq!(numbers(&mut ring), [3, 4]);
         // A sample larger than the limit is not kept, and does not affect later ones.
         ring.push(sample(6, 5000));

@@ -34,12 +34,12 @@ use ros2probe_message::Library;
 use ros2probe_wire::DomainId;
 
 /// Maximum number of ended recordings whose report is kept.
-const ENDED: usize = 16;
+const MAX_ENDED: usize = 16;
 /// Maximum sizes of a bag's chunk and of a file's index in memory, in bytes.
 const CHUNK_BYTES: u64 = 1 << 20;
 const INDEX_BYTES: u64 = 1 << 20;
 /// Maximum length of the name of a recording, in bytes.
-const NAME: usize = 128;
+const MAX_NAME: usize = 128;
 
 /// All recordings of an agent.
 #[derive(Debug)]
@@ -91,7 +91,7 @@ pub struct RecordingOptions {
     /// Name of the directory; the current time if omitted.
     pub name: Option<String>,
     /// Selection of topics.
-    pub asked: FilterOptions,
+    pub requested: FilterOptions,
     /// Domain of the topics.
     pub domain_id: u32,
     /// Options of the bag.
@@ -110,14 +110,14 @@ pub struct Recording {
     /// Domain of the topics.
     pub domain_id: u32,
     /// Selection of topics.
-    pub asked: FilterOptions,
+    pub requested: FilterOptions,
     /// Time of its start.
     pub began: SystemTime,
     begin: Begin,
     status: Mutex<Status>,
     commands: Mutex<Sender<Command>>,
     thread: Mutex<Option<JoinHandle<()>>>,
-    over: Notify,
+    completed: Notify,
 }
 
 impl Recording {
@@ -219,7 +219,7 @@ impl Recordings {
     ///
     /// Returns [`Refusal`] if the recording cannot start.
     pub fn begin(&self, wanted: RecordingOptions) -> Result<Arc<Recording>, Refusal> {
-        let filter = Filter::new(wanted.asked.clone())?;
+        let filter = Filter::new(wanted.requested.clone())?;
         let (name, directory) = self.bag_directory(wanted.name)?;
         let mut list = self.list();
         let Some(place) = self.slots.take() else {
@@ -237,7 +237,7 @@ impl Recordings {
         let writer = writer.map_err(|error| refusal(&name, error))?;
         let sources = self.sources(wanted.domain_id);
         let mut recorder =
-            Recorder::new(writer, filter, wanted.domain_id, before, sources).within(quota);
+            Recorder::new(writer, filter, wanted.domain_id, before, sources).with_quota(quota);
         recorder.pause(wanted.paused);
         self.declare(&mut recorder, &subscription, wanted.domain_id)
             .map_err(|error| refusal(&name, error))?;
@@ -246,13 +246,13 @@ impl Recordings {
             name,
             directory,
             domain_id: wanted.domain_id,
-            asked: wanted.asked,
+            requested: wanted.requested,
             began: SystemTime::now(),
             begin: subscription.begin(),
             status: Mutex::default(),
             commands: Mutex::new(give),
             thread: Mutex::default(),
-            over: Notify::new(),
+            completed: Notify::new(),
         });
         self.events.record(AgentEvent::RecordingStarted {
             recording: recording.name.clone(),
@@ -294,7 +294,7 @@ impl Recordings {
     ) -> Result<JoinHandle<()>, Refusal> {
         let worker = Arc::clone(recording);
         let (events, figures) = (Arc::clone(&self.events), Arc::clone(&self.figures));
-        let work = move || worker.work(recorder, source, &commands, &events, &figures);
+        let work = move || worker.record(recorder, source, &commands, &events, &figures);
         let thread = std::thread::Builder::new().name("recording".to_owned());
         thread.spawn(work).map_err(|error| {
             let _ = std::fs::remove_dir_all(&recording.directory);
@@ -409,8 +409,8 @@ impl Recordings {
         }
     }
 
-    /// Returns whether a bag may be removed for another one: if bags are delivered, only a delivered
-    /// one.
+    /// Returns whether a bag may be removed for another one: if bags are delivered, only a
+    /// delivered one.
     pub(super) fn may_remove(&self, bag: &Path) -> bool {
         let receipts = self.receipts.as_deref();
         receipts.is_none_or(|state| ros2probe_ship::is_delivered(state, bag))
@@ -424,11 +424,11 @@ impl Recordings {
         let name = name.unwrap_or_else(default_name);
         let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '.');
         let is_name = !name.is_empty()
-            && name.len() <= NAME
+            && name.len() <= MAX_NAME
             && !name.starts_with('.')
             && name.chars().all(plain);
         if !is_name {
-            return Err(Refusal::Name(name.chars().take(NAME).collect()));
+            return Err(Refusal::Name(name.chars().take(MAX_NAME).collect()));
         }
         let place = directory.join(&name);
         Ok((name, place))
@@ -453,11 +453,11 @@ impl Recording {
     }
 
     /// Waits at most `timeout` for the bag to be complete. Returns whether the bag is complete.
-    pub async fn over(&self, timeout: Duration) -> bool {
+    pub async fn wait_complete(&self, timeout: Duration) -> bool {
         let wait = async {
             loop {
-                let over = self.over.notified();
-                if self.is_over() {
+                let over = self.completed.notified();
+                if self.is_complete() {
                     return;
                 }
                 over.await;
@@ -466,11 +466,11 @@ impl Recording {
         tokio::time::timeout(timeout, wait).await.is_ok()
     }
 
-    fn is_over(&self) -> bool {
+    fn is_complete(&self) -> bool {
         locked(&self.status).state == RecordingState::Ended
     }
 
-    fn work(
+    fn record(
         &self,
         recorder: Recorder<'static>,
         (mut subscription, slot): (Subscription, Slot),
@@ -548,7 +548,7 @@ impl Recording {
             error,
         };
         *locked(&self.status) = status;
-        self.over.notify_waiters();
+        self.completed.notify_waiters();
     }
 }
 
@@ -597,10 +597,10 @@ pub(super) fn causes(error: &ros2probe_bag::Error) -> String {
 
 /// Removes all but the latest ended recordings.
 fn forget_ended(list: &mut Vec<Arc<Recording>>) {
-    let mut surplus = list.iter().filter(|each| each.is_over()).count();
-    surplus = surplus.saturating_sub(ENDED);
+    let mut surplus = list.iter().filter(|each| each.is_complete()).count();
+    surplus = surplus.saturating_sub(MAX_ENDED);
     list.retain(|each| {
-        let goes = surplus > 0 && each.is_over();
+        let goes = surplus > 0 && each.is_complete();
         surplus -= usize::from(goes);
         !goes
     });

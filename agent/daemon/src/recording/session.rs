@@ -40,7 +40,7 @@ pub enum Command {
     /// Complete the bag.
     Stop,
     /// Complete the bag without waiting for messages in flight or compressing whole files.
-    Hurry,
+    Abort,
 }
 
 /// Current activity of a recording.
@@ -78,12 +78,12 @@ struct Completion<'a, T> {
     commands: &'a Receiver<Command>,
     report_activity: T,
     reported: Instant,
-    hurry: bool,
+    is_aborted: bool,
 }
 
 /// Records until the end. The second value is the source's error, if it failed. `report_activity`
-/// is called regularly and after each command. `is_behind` returns whether items wait that `next` has
-/// already received: they are recorded before the end, however long it takes.
+/// is called regularly and after each command. `is_behind` returns whether items wait that `next`
+/// has already received: they are recorded before the end, however long it takes.
 pub fn record<E>(
     mut recorder: Recorder<'_>,
     mut next: impl FnMut(Duration) -> Result<NextItem, E>,
@@ -93,21 +93,21 @@ pub fn record<E>(
 ) -> (Finished, Option<E>) {
     let mut compressing = Compressing::default();
     let mut stopping: Option<(Timestamp, Instant)> = None;
-    let mut hurry = false;
+    let mut abort = false;
     let mut reported = Instant::now();
     report_activity(Activity::Recording(&recorder));
     let (refused, broke) = loop {
-        match carry_out(commands, &mut recorder) {
+        match execute(commands, &mut recorder) {
             Ok(CommandOutcome::Nothing) => {}
-            Ok(CommandOutcome::Out) => report_activity(Activity::Recording(&recorder)),
+            Ok(CommandOutcome::SnapshotWritten) => report_activity(Activity::Recording(&recorder)),
             Ok(CommandOutcome::Stop) => {
                 if stopping.is_none() {
                     stopping = Some((now(), Instant::now() + DRAIN_TIMEOUT));
                     report_activity(Activity::Completing);
                 }
             }
-            Ok(CommandOutcome::Hurry) => {
-                hurry = true;
+            Ok(CommandOutcome::Abort) => {
+                abort = true;
                 break (None, None);
             }
             Err(error) => break (Some(error), None),
@@ -145,7 +145,7 @@ pub fn record<E>(
         commands,
         report_activity,
         reported: Instant::now(),
-        hurry,
+        is_aborted: abort,
     };
     let compressed = compressing.finish(&mut recorder, &mut completion);
     let refused = refused.or(compressed.err());
@@ -158,12 +158,12 @@ pub fn record<E>(
 
 enum CommandOutcome {
     Nothing,
-    Out,
+    SnapshotWritten,
     Stop,
-    Hurry,
+    Abort,
 }
 
-fn carry_out(
+fn execute(
     commands: &Receiver<Command>,
     recorder: &mut Recorder<'_>,
 ) -> Result<CommandOutcome, Error> {
@@ -175,12 +175,12 @@ fn carry_out(
             Ok(Command::Toggle) => recorder.pause(!recorder.is_paused()),
             Ok(Command::Split) => recorder.split()?,
             Ok(Command::Snapshot) => recorder.snapshot()?,
-            Ok(Command::Hurry) => return Ok(CommandOutcome::Hurry),
+            Ok(Command::Abort) => return Ok(CommandOutcome::Abort),
             // All senders of commands were dropped.
             Ok(Command::Stop) | Err(TryRecvError::Disconnected) => return Ok(CommandOutcome::Stop),
             Err(TryRecvError::Empty) => return Ok(outcome),
         }
-        outcome = CommandOutcome::Out;
+        outcome = CommandOutcome::SnapshotWritten;
     }
 }
 
@@ -243,14 +243,14 @@ impl CompressionTask {
         completion: &mut Completion<'_, impl FnMut(Activity<'_>)>,
     ) -> Result<Option<Compressed>, Error> {
         while !self.thread.is_finished() {
-            if completion.is_hurried() {
-                self.progress.give_up();
+            if completion.is_aborted() {
+                self.progress.cancel();
                 break;
             }
             completion.compressing(self.progress.read(), self.bytes);
             std::thread::sleep(POLL_INTERVAL);
         }
-        let is_given_up = self.progress.is_given_up();
+        let is_given_up = self.progress.is_cancelled();
         match self.join() {
             Some(Ok(done)) => Ok(Some(done)),
             Some(Err(error)) if !is_given_up => Err(error),
@@ -260,12 +260,12 @@ impl CompressionTask {
 }
 
 impl<T: FnMut(Activity<'_>)> Completion<'_, T> {
-    fn is_hurried(&mut self) -> bool {
-        self.hurry |= self
+    fn is_aborted(&mut self) -> bool {
+        self.is_aborted |= self
             .commands
             .try_iter()
-            .any(|order| order == Command::Hurry);
-        self.hurry
+            .any(|order| order == Command::Abort);
+        self.is_aborted
     }
 
     fn compressing(&mut self, done: u64, of: u64) {

@@ -66,7 +66,7 @@ pub struct Snapshots {
 struct Snapshot {
     settings: SnapshotSettings,
     clients: SyncSender<Answer>,
-    asked: Arc<AtomicBool>,
+    is_requested: Arc<AtomicBool>,
     thread: Mutex<Option<JoinHandle<()>>>,
 }
 
@@ -94,7 +94,7 @@ impl Snapshots {
             let asked = Arc::new(AtomicBool::new(false));
             let keeper = SnapshotTask::new(settings.clone(), Arc::clone(recordings));
             let (stopping, ordered) = (Arc::clone(&stop), Arc::clone(&asked));
-            let work = move || keeper.work(subscription, &waiting, &ordered, &stopping);
+            let work = move || keeper.run(subscription, &waiting, &ordered, &stopping);
             let thread = std::thread::Builder::new().name("snapshot".to_owned());
             let thread = thread.spawn(work).map_err(|error| Refusal::Storage {
                 reason: format!("cannot start the snapshot's thread: {error}"),
@@ -102,7 +102,7 @@ impl Snapshots {
             list.push(Snapshot {
                 settings: settings.clone(),
                 clients,
-                asked,
+                is_requested: asked,
                 thread: Mutex::new(Some(thread)),
             });
         }
@@ -129,7 +129,7 @@ impl Snapshots {
     /// Requests a bag of each snapshot.
     pub fn write_all(&self) {
         for snapshot in &self.list {
-            snapshot.asked.store(true, Ordering::Relaxed);
+            snapshot.is_requested.store(true, Ordering::Relaxed);
         }
     }
 

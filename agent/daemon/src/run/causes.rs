@@ -10,7 +10,7 @@ use ros2probe_model::facts::event::{Event, EventKind};
 use ros2probe_model::facts::watch::{Watch, WatchState};
 
 /// Time for which causes are observed after an event.
-const HELD: Duration = Duration::from_secs(60);
+const OBSERVATION_TIME: Duration = Duration::from_secs(60);
 
 /// What watches and events require about late calls.
 #[derive(Default)]
@@ -44,7 +44,7 @@ impl CauseDemand {
     /// Adds the demand to that of clients.
     pub(super) fn add_to(&self, demand: &mut LateDemand, now: Instant) {
         demand.bounds.extend_from_slice(&self.expected);
-        let is_held = |last| now.saturating_duration_since(last) < HELD;
+        let is_held = |last| now.saturating_duration_since(last) < OBSERVATION_TIME;
         demand.has_question |= self.last.is_some_and(is_held);
     }
 }

@@ -39,22 +39,22 @@ use ros2probe_model::report::snapshot::{DecodeErrorCount, Snapshot, TableFacts};
 pub use source::{Source, probe};
 
 /// Maximum time for which a replay runs without checking commands.
-const SLICE: Duration = Duration::from_millis(250);
+const REPLAY_SLICE: Duration = Duration::from_millis(250);
 /// Maximum time for which a live source waits without checking commands and the clock. Captured
 /// frames, a half-full record ring and commands end the wait earlier. Each round costs a wake-up,
 /// and on a quiet host nothing else wakes the thread.
-const SLICE_LIVE: Duration = Duration::from_secs(1);
+const LIVE_SLICE: Duration = Duration::from_secs(1);
 /// Minimum interval of snapshots without requests. They are due each second, and a wake-up may be
 /// early or late.
-const PUBLISH: Duration = Duration::from_millis(900);
+const PUBLISH_INTERVAL: Duration = Duration::from_millis(900);
 /// Minimum interval of snapshots with requests.
-const PUBLISH_ASKED: Duration = Duration::from_millis(50);
+const REQUESTED_PUBLISH_INTERVAL: Duration = Duration::from_millis(50);
 /// Maximum interval of snapshots without a reader, while the graph does not change.
-const SNAPSHOT_UNREAD: Duration = Duration::from_secs(5);
+const UNREAD_PUBLISH_INTERVAL: Duration = Duration::from_secs(5);
 /// Maximum interval of clock items to subscribers during silence.
-const SLICE_SUBSCRIBED: Duration = Duration::from_millis(90);
+const SUBSCRIBED_SLICE: Duration = Duration::from_millis(90);
 /// Maximum time for which readers wait for breakpoints in the processes that send to them.
-const ATTACHES_WITHIN: Duration = Duration::from_secs(5);
+const ATTACH_TIMEOUT: Duration = Duration::from_secs(5);
 const CLOCK_INTERVAL: Duration = Duration::from_millis(100);
 /// Minimum step back of the clock which means that the clock was set.
 const SET_BACK: Duration = Duration::from_secs(1);
@@ -94,7 +94,7 @@ pub struct Run {
     /// Time of the latest snapshot, and the revision of the graph in it.
     taken: Option<(Instant, u64)>,
     stop: CancellationToken,
-    keeper: Option<StateWriter>,
+    state_writer: Option<StateWriter>,
     history: Option<History>,
 }
 
@@ -141,20 +141,23 @@ impl Run {
             complete_until: Timestamp::default(),
             taken: None,
             stop,
-            keeper: None,
+            state_writer: None,
             history: None,
         }
     }
 
     /// Saves the discovery state for the next start.
     #[must_use]
-    pub fn keeping(self, keeper: Option<StateWriter>) -> Self {
-        Self { keeper, ..self }
+    pub fn with_state_writer(self, keeper: Option<StateWriter>) -> Self {
+        Self {
+            state_writer: keeper,
+            ..self
+        }
     }
 
     /// Keeps the measurements of the last seconds.
     #[must_use]
-    pub fn remembering(self, history: Option<History>) -> Self {
+    pub fn with_history(self, history: Option<History>) -> Self {
         Self { history, ..self }
     }
 
@@ -164,19 +167,19 @@ impl Run {
     ///
     /// Fails if the source fails permanently.
     pub fn run(mut self) -> Result<(), RunError> {
-        let ended = self.work();
+        let ended = self.run_source();
         self.subscriptions.end(match &ended {
             Ok(()) if self.source.is_finished() => "end of capture",
             Ok(()) => "agent ends",
             Err(_) => "the capture failed",
         });
-        if let Some(keeper) = self.keeper.take() {
+        if let Some(keeper) = self.state_writer.take() {
             keeper.finish(self.observer.memory());
         }
         ended
     }
 
-    fn work(&mut self) -> Result<(), RunError> {
+    fn run_source(&mut self) -> Result<(), RunError> {
         let has_applied_lists = self.take_watches();
         self.hand_over();
         if has_applied_lists {
@@ -189,14 +192,14 @@ impl Run {
             let subscribed = self.subscriptions.is_open();
             let slice = if !self.observer.has_applied_lists() {
                 Duration::ZERO
-            } else if self.outputs.latest.is_asked() {
-                PUBLISH_ASKED
+            } else if self.outputs.latest.is_requested() {
+                REQUESTED_PUBLISH_INTERVAL
             } else if subscribed {
-                SLICE_SUBSCRIBED
+                SUBSCRIBED_SLICE
             } else {
                 self.idle_slice()
             };
-            let pace = self.follow_pace();
+            let pace = self.apply_pace();
             let step = self.step(subscribed);
             let bell = self.outputs.latest.bell().descriptor();
             let polled = self.source.poll(slice, step, bell, &mut self.observer);
@@ -211,7 +214,7 @@ impl Run {
             } else {
                 self.observer.input(Input::Time(self.source.clock()));
             }
-            self.remember();
+            self.store_history();
             let has_event = self.hand_over();
             if has_applied_lists {
                 self.confirm_requests();
@@ -219,11 +222,11 @@ impl Run {
             self.confirm_complete();
             let has_arrived = self.end_jump(pace, has_event);
             let age = published.elapsed();
-            let is_current = age < PUBLISH_ASKED && !self.source.is_paused();
-            let is_asked = !is_current && self.outputs.latest.is_asked();
+            let is_current = age < REQUESTED_PUBLISH_INTERVAL && !self.source.is_paused();
+            let is_asked = !is_current && self.outputs.latest.is_requested();
             let held = self.source.reached_pause();
             let must = finished || held || has_arrived || polled.is_err() || is_asked;
-            if must || age >= PUBLISH {
+            if must || age >= PUBLISH_INTERVAL {
                 if must || self.is_snapshot_due() {
                     self.publish();
                 } else {
@@ -257,7 +260,7 @@ impl Run {
     }
 
     /// Makes a replay go on as clients request it, and returns what they request.
-    fn follow_pace(&mut self) -> Pace {
+    fn apply_pace(&mut self) -> Pace {
         let pace = self.outputs.latest.replay_pace().get();
         if let Source::Replay(replay) = &mut self.source {
             replay.follow(&pace);
@@ -271,8 +274,8 @@ impl Run {
             return false;
         };
         let has_arrived = match followed.jump {
-            Some(Jump::To(_)) => replay.has_arrived(),
-            Some(Jump::NextEvent) => has_event || replay.has_arrived(),
+            Some(Jump::To(_)) => replay.has_reached_target(),
+            Some(Jump::NextEvent) => has_event || replay.has_reached_target(),
             None => false,
         };
         if has_arrived {
@@ -290,12 +293,12 @@ impl Run {
     /// of a second.
     fn idle_slice(&self) -> Duration {
         if let Source::Replay(_) = self.source {
-            return SLICE;
+            return REPLAY_SLICE;
         }
         let decision = self.observer.next_decision();
         let second = self.history.as_ref().map(History::due);
         let next = second.map_or(decision, |second| second.min(decision));
-        (next - self.source.clock()).min(SLICE_LIVE)
+        (next - self.source.clock()).min(LIVE_SLICE)
     }
 
     /// Returns the next time at which a replay has to return: for a clock item to subscriptions, or
@@ -312,7 +315,7 @@ impl Run {
     }
 
     /// Stores the measurements of the last second.
-    fn remember(&mut self) {
+    fn store_history(&mut self) {
         let now = self.source.clock();
         let Some(history) = self.history.as_mut().filter(|history| history.is_due(now)) else {
             return;
@@ -320,24 +323,24 @@ impl Run {
         history.take(now, self.observer.measured(now));
         let latest = &self.outputs.latest;
         // Ten minutes of history are a list of 600 seconds, which may have no reader.
-        if latest.wants_past() || !matches!(self.source, Source::Live(_)) {
+        if latest.is_history_requested() || !matches!(self.source, Source::Live(_)) {
             latest.publish_past(history.past());
         }
     }
 
-    /// Passes new items to the outputs. Slow readers block this thread only during a replay. Returns
-    /// whether an event other than of a participant or endpoint is among them.
+    /// Passes new items to the outputs. Slow readers block this thread only during a replay.
+    /// Returns whether an event other than of a participant or endpoint is among them.
     fn hand_over(&mut self) -> bool {
         let now = self.source.clock();
         let output = self.observer.drain();
         if let Source::Live(live) = &mut self.source {
             live.apply(&output.interest);
             let now = Instant::now();
-            live.want_inside(self.outputs.latest.are_calls_wanted(now));
+            live.request_inside(self.outputs.latest.are_calls_requested(now));
             let mut demand = self.outputs.latest.late_demand(now);
             self.causes.note(&output.events.events, now);
             self.causes.add_to(&mut demand, now);
-            live.want_late(&demand);
+            live.request_late_calls(&demand);
         }
         let mut events = output.events.events.iter();
         let has_event = events.any(|event| {
@@ -398,7 +401,8 @@ impl Run {
     fn confirm_requests(&mut self) {
         if let Some(sample_requests) = self.sample_requests.take() {
             let observer = &mut self.observer;
-            (self.subscriptions).in_force(&sample_requests, |request| observer.latched(request));
+            (self.subscriptions)
+                .confirm_applied(&sample_requests, |request| observer.latched(request));
             self.unconfirmed = Some((Arc::clone(&sample_requests), Instant::now()));
             if sample_requests.is_empty() {
                 // Buffers of large messages are free now, and the next subscription may begin much
@@ -408,7 +412,7 @@ impl Run {
         }
     }
 
-    /// Confirms requests in force once every message is captured, or after [`ATTACHES_WITHIN`].
+    /// Confirms requests in force once every message is captured, or after [`ATTACH_TIMEOUT`].
     /// Readers then report why messages may be missing.
     fn confirm_complete(&mut self) {
         let Some((_, since)) = self.unconfirmed else {
@@ -418,7 +422,7 @@ impl Run {
             Source::Live(live) => live.is_attaching(&self.observer),
             Source::Replay(_) => false,
         };
-        if is_attaching && since.elapsed() < ATTACHES_WITHIN {
+        if is_attaching && since.elapsed() < ATTACH_TIMEOUT {
             return;
         }
         if let Some((sample_requests, _)) = self.unconfirmed.take() {
@@ -459,7 +463,7 @@ impl Run {
         if let Some(history) = &self.history {
             snapshot.tables.push(history.table());
             // A reader that waits for this state may read the last seconds next.
-            if self.outputs.latest.is_asked() {
+            if self.outputs.latest.is_requested() {
                 self.outputs.latest.publish_past(history.past());
             }
         }
@@ -475,9 +479,9 @@ impl Run {
     /// Returns whether the latest snapshot was read since the last call, or no longer describes the
     /// graph.
     fn is_snapshot_due(&self) -> bool {
-        let was_read = self.outputs.latest.was_read();
+        let was_read = self.outputs.latest.was_snapshot_read();
         let is_current = self.taken.is_some_and(|(at, revision)| {
-            at.elapsed() < SNAPSHOT_UNREAD && revision == self.observer.memory_revision()
+            at.elapsed() < UNREAD_PUBLISH_INTERVAL && revision == self.observer.memory_revision()
         });
         was_read || !is_current || !matches!(self.source, Source::Live(_))
     }
@@ -489,9 +493,9 @@ impl Run {
         facts.replay_pace = self.outputs.latest.replay_pace().get();
         facts.subscriptions = self.subscriptions.facts();
         facts.subscriptions.retained_bytes = self.observer.latched_bytes();
-        if let Some(keeper) = &mut self.keeper {
+        if let Some(keeper) = &mut self.state_writer {
             let (revision, now) = (self.observer.memory_revision(), Instant::now());
-            if keeper.wants(revision, now) {
+            if keeper.is_write_due(revision, now) {
                 keeper.keep(self.observer.memory(), revision, now);
             }
             let state = keeper.facts();

@@ -20,9 +20,9 @@ use ros2probe_capture::streams::Streams;
 use ros2probe_model::observe::observer::Observer;
 
 /// Interval of progress reports on a terminal.
-const PROGRESS: Duration = Duration::from_secs(1);
+const PROGRESS_INTERVAL: Duration = Duration::from_secs(1);
 /// Minimum gap between packets that the replay skips in one step.
-const FAR: Duration = Duration::from_secs(3600);
+const MIN_SKIPPED_GAP: Duration = Duration::from_secs(3600);
 
 /// Polling interval of requests while a replay is paused.
 const PAUSE_POLL: Duration = Duration::from_millis(5);
@@ -163,13 +163,13 @@ impl Replay {
 
     /// Makes the replay end at this time, as if the capture ended there.
     #[must_use]
-    pub fn until(self, until: Option<CaptureTime>) -> Self {
+    pub fn ending_at(self, until: Option<CaptureTime>) -> Self {
         Self { until, ..self }
     }
 
     /// Disables progress reports, for commands that use the terminal.
     #[must_use]
-    pub fn quiet(self) -> Self {
+    pub fn without_progress(self) -> Self {
         Self {
             progress: None,
             ..self
@@ -187,7 +187,7 @@ impl Replay {
 
     /// Goes on as clients request it.
     pub fn follow(&mut self, pace: &Pace) {
-        let is_held = pace.is_still();
+        let is_held = pace.is_paused();
         let speed = match pace.jump {
             Some(_) => Speed::Max,
             None => pace.speed.unwrap_or(self.started_speed),
@@ -207,7 +207,7 @@ impl Replay {
 
     /// Returns whether the time was reached to which it goes without waiting.
     #[must_use]
-    pub fn has_arrived(&self) -> bool {
+    pub fn has_reached_target(&self) -> bool {
         self.finished || self.target.is_some_and(|target| self.clock >= target)
     }
 
@@ -218,7 +218,7 @@ impl Replay {
     }
 
     /// Delivers packets that are due within `timeout`. Returns earlier at the end of the capture,
-    /// before a packet at or after `until`, and when the model has much output.
+    /// before a packet at or after `ending_at`, and when the model has much output.
     ///
     /// # Errors
     ///
@@ -243,7 +243,7 @@ impl Replay {
             if let Some(waiting) = &self.waiting {
                 let (time, beginning) = (waiting.time, self.began.unwrap_or_default());
                 let pause = self.pause.as_ref();
-                if pause.is_some_and(|pause| pause.at_or_behind(time, beginning)) {
+                if pause.is_some_and(|pause| pause.is_at_or_after(time, beginning)) {
                     self.wait();
                     break;
                 }
@@ -255,7 +255,7 @@ impl Replay {
                 if let Some(until) = later
                     && delay.is_zero()
                 {
-                    let is_far = time - until > FAR;
+                    let is_far = time - until > MIN_SKIPPED_GAP;
                     let time = if is_far { time.0 - 1 } else { until.0 };
                     self.clock = self.clock.max(Timestamp(time));
                     break;
@@ -380,7 +380,7 @@ impl Replay {
         }
         let beginning = self.began.unwrap_or_default();
         let time = self.waiting.as_ref().map(|waiting| waiting.time);
-        if time.is_some_and(|time| pause.at_or_behind(time, beginning)) {
+        if time.is_some_and(|time| pause.is_at_or_after(time, beginning)) {
             let begins = pause.at.map(|moment| moment.in_capture(beginning));
             self.clock = self.clock.max(begins.unwrap_or_default());
         }
@@ -391,8 +391,9 @@ impl Replay {
     pub fn reached_pause(&self) -> bool {
         let time = self.waiting.as_ref().map(|waiting| waiting.time);
         let beginning = self.began.unwrap_or_default();
-        time.zip(self.pause.as_ref())
-            .is_some_and(|(time, pause)| pause.at_or_behind(time, beginning) && !pause.is_reported)
+        time.zip(self.pause.as_ref()).is_some_and(|(time, pause)| {
+            pause.is_at_or_after(time, beginning) && !pause.is_reported
+        })
     }
 
     /// Returns whether the replay is paused and the pause was reported.
@@ -472,7 +473,7 @@ impl Replay {
         if self.finished {
             eprint!("\r\x1b[K");
             self.progress = None;
-        } else if last.elapsed() >= PROGRESS {
+        } else if last.elapsed() >= PROGRESS_INTERVAL {
             self.progress = Some(Instant::now());
             let seconds =
                 self.clock.nanoseconds_since(self.began.unwrap_or_default()) / 1_000_000_000;
@@ -493,7 +494,7 @@ fn step(speed: Speed) -> Duration {
 }
 
 impl PausePoint {
-    fn at_or_behind(&self, time: Timestamp, beginning: Timestamp) -> bool {
+    fn is_at_or_after(&self, time: Timestamp, beginning: Timestamp) -> bool {
         self.at.is_none_or(|at| at.in_capture(beginning) <= time)
     }
 }

@@ -252,7 +252,7 @@ fn live_facts(live: &mut LiveSource, now: Instant) -> AgentFacts {
         packets: Some(messages),
         dropped: None,
     }));
-    let gone = live.gone();
+    let gone = live.missing_object();
     let stalled = live.stalled().next().map(|stalled| stalled.to_string());
     let pending = live.pending();
     let counters = live.counters().unwrap_or_default();
@@ -281,11 +281,11 @@ fn live_facts(live: &mut LiveSource, now: Instant) -> AgentFacts {
         source_reason: live.without_host().map(str::to_owned),
         abilities: abilities(live),
         on_demand: on_demand(live),
-        blind: blind(live),
-        gone,
+        missing_abilities: blind(live),
+        missing_object: gone,
         stalled,
         pending,
-        attached_anew: live.attached_anew(),
+        reattachments: live.reattachments(),
         pieces_dropped: value(Counter::PiecesLost),
         contended: value(Counter::Contended),
         shared_memory: live.shared_memory().map(shared_memory),
@@ -332,7 +332,7 @@ fn inside(live: &LiveSource) -> Option<InsideSourceFacts> {
         processes: library.processes as u64,
         refused: library.refused,
     });
-    let resting = || facts.is_resting.then(|| INSIDE_IDLE.to_owned());
+    let idle = || facts.is_idle.then(|| INSIDE_IDLE.to_owned());
     let reason_off = facts.detached.or_else(|| stalled(live, Part::Inside));
     Some(InsideSourceFacts {
         mode: match (facts.is_on_demand, facts.has_callbacks) {
@@ -340,14 +340,14 @@ fn inside(live: &LiveSource) -> Option<InsideSourceFacts> {
             (false, true) => "full",
             (false, false) => "topics",
         },
-        is_resting: facts.is_resting,
+        is_idle: facts.is_idle,
         shows_rates: facts.shows_rates,
         libraries: libraries.collect(),
         counters: facts.counters,
         late: facts.late,
         without_events: facts.without_events,
         without_deliveries: facts.without_deliveries,
-        reason_off: reason_off.or_else(resting),
+        reason_off: reason_off.or_else(idle),
     })
 }
 
@@ -400,7 +400,7 @@ fn shared_memory(facts: shm::Facts) -> SharedMemoryFacts {
             ("refused", facts.refused),
         ],
         cpu_seconds: facts.cpu_seconds,
-        looks: facts.looks,
+        polls: facts.polls,
     }
 }
 
@@ -430,7 +430,7 @@ fn abilities(live: &LiveSource) -> Vec<Ability> {
     if is_exact && !is_stalled(Part::Exact) {
         abilities.push(Ability::SharedMemoryExact);
     }
-    let is_observed = live.inside().is_some_and(|facts| !facts.is_resting);
+    let is_observed = live.inside().is_some_and(|facts| !facts.is_idle);
     if is_observed && !is_stalled(Part::Inside) {
         abilities.push(Ability::Inside);
     }
@@ -440,7 +440,7 @@ fn abilities(live: &LiveSource) -> Vec<Ability> {
 /// Returns missing abilities that this source gains while a client needs them.
 fn on_demand(live: &LiveSource) -> Vec<Ability> {
     let is_exact_resting = live.exact().is_some_and(|facts| facts.is_resting);
-    let is_inside_resting = live.inside().is_some_and(|facts| facts.is_resting);
+    let is_inside_resting = live.inside().is_some_and(|facts| facts.is_idle);
     let abilities = [
         is_exact_resting.then_some(Ability::SharedMemoryExact),
         is_inside_resting.then_some(Ability::Inside),

@@ -28,13 +28,13 @@ fn a_written_file_is_read_back_and_no_other_file_remains() {
         .unwrap()
         .map(|entry| entry.unwrap().file_name())
         .collect();
-    assert_eq!(names, [FILE]);
+    assert_eq!(names, [STATE_FILE]);
 }
 
 #[test]
 fn an_invalid_state_file_is_moved_aside_and_a_new_one_is_written() {
     let (place, directory) = directory();
-    let file = place.path().join(FILE);
+    let file = place.path().join(STATE_FILE);
     directory.write(Memory::default()).unwrap();
     let whole = fs::read(&file).unwrap();
     for length in 0..whole.len() - 2 {
@@ -57,7 +57,7 @@ fn an_invalid_state_file_is_moved_aside_and_a_new_one_is_written() {
 #[test]
 fn a_file_of_a_newer_agent_stays_in_place_even_if_it_is_unreadable() {
     let (place, directory) = directory();
-    let file = place.path().join(FILE);
+    let file = place.path().join(STATE_FILE);
     for (newer, version) in [
         (&br#"{"version": 2, "boot": {}, "clouds": []}"#[..], 2),
         (br#"{"clouds": [], "version": 4000000000}"#, 4_000_000_000),
@@ -79,7 +79,7 @@ fn a_file_of_a_newer_agent_stays_in_place_even_if_it_is_unreadable() {
 #[test]
 fn every_version_is_read_by_its_own_reader_and_the_last_one_is_written() {
     assert_eq!(
-        FORM.readers.last().map(|(version, _)| *version),
+        STATE_FORM.readers.last().map(|(version, _)| *version),
         Some(VERSION)
     );
     #[derive(Debug, Deserialize, PartialEq)]
@@ -91,7 +91,7 @@ fn every_version_is_read_by_its_own_reader_and_the_last_one_is_written() {
         kelvin: i32,
     }
     const THERMOMETER: Form<New> = Form {
-        file: FILE,
+        file: STATE_FILE,
         readers: &[
             (1, |bytes| {
                 from_json::<Old>(bytes).map(|old| New {
@@ -103,7 +103,7 @@ fn every_version_is_read_by_its_own_reader_and_the_last_one_is_written() {
     };
     let (place, directory) = directory();
     let read = |text: &str| {
-        fs::write(place.path().join(FILE), text).unwrap();
+        fs::write(place.path().join(STATE_FILE), text).unwrap();
         directory.read(&THERMOMETER)
     };
     let this = |kelvin| Found::This(New { kelvin });
@@ -138,7 +138,7 @@ fn a_file_in_the_first_format_is_read() {
             "message_type":"sensor_msgs/msg/PointCloud2","type_hash":null,"reliability":2,
             "durability":0,"history":[0,10],"deadline":null,"lifespan":null,"liveliness":0,
             "liveliness_lease":null,"ownership":0,"minimum_separation":0,"partitions":[]}]}]}"#;
-    fs::write(place.path().join(FILE), first.replace("BOOT", &boot)).unwrap();
+    fs::write(place.path().join(STATE_FILE), first.replace("BOOT", &boot)).unwrap();
     let Loaded::Known(memory) = directory.load() else {
         panic!("{:?}", directory.load());
     };
@@ -148,7 +148,7 @@ fn a_file_in_the_first_format_is_read() {
 #[test]
 fn state_of_an_earlier_boot_is_not_used() {
     let (place, directory) = directory();
-    let file = place.path().join(FILE);
+    let file = place.path().join(STATE_FILE);
     fs::write(&file, r#"{"version":1,"boot":"other","participants":[]}"#).unwrap();
     assert_eq!(directory.load(), Loaded::AnotherBoot);
 }
@@ -158,21 +158,21 @@ fn a_partial_file_of_a_killed_agent_is_ignored_and_removed() {
     let (place, directory) = directory();
     directory.write(Memory::default()).unwrap();
     drop(directory);
-    fs::write(place.path().join(NEW_FILE), "{\"version\":1,\"bo").unwrap();
+    fs::write(place.path().join(NEW_STATE_FILE), "{\"version\":1,\"bo").unwrap();
     let directory = StateDirectory::open(place.path()).unwrap();
     assert_eq!(directory.load(), Loaded::Known(Memory::default()));
     assert_eq!(fs::read_dir(place.path()).unwrap().count(), 1);
 }
 
 #[test]
-fn a_link_in_place_of_a_state_file_is_neither_read_nor_written_through() {
+fn a_symbolic_link_instead_of_a_state_file_is_neither_read_nor_written() {
     let (place, directory) = directory();
     let elsewhere = tempfile::tempdir().unwrap();
     let target = elsewhere.path().join("target");
     directory.write(Memory::default()).unwrap();
-    fs::rename(place.path().join(FILE), &target).unwrap();
+    fs::rename(place.path().join(STATE_FILE), &target).unwrap();
     let text = fs::read_to_string(&target).unwrap();
-    for name in [FILE, NEW_FILE] {
+    for name in [STATE_FILE, NEW_STATE_FILE] {
         std::os::unix::fs::symlink(&target, place.path().join(name)).unwrap();
     }
     let reason = unusable(&directory);
@@ -180,7 +180,7 @@ fn a_link_in_place_of_a_state_file_is_neither_read_nor_written_through() {
     directory.write(Memory::default()).unwrap();
     assert_eq!(fs::read_to_string(&target).unwrap(), text);
     assert!(
-        fs::symlink_metadata(place.path().join(FILE))
+        fs::symlink_metadata(place.path().join(STATE_FILE))
             .unwrap()
             .is_file()
     );
@@ -188,13 +188,13 @@ fn a_link_in_place_of_a_state_file_is_neither_read_nor_written_through() {
 }
 
 #[test]
-fn a_pipe_or_a_directory_in_place_of_a_state_file_does_not_block_the_start() {
+fn a_pipe_or_directory_instead_of_a_state_file_does_not_block_the_start() {
     let (place, directory) = directory();
-    let path = place.path().join(FILE);
+    let path = place.path().join(STATE_FILE);
     mknodat(CWD, &path, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0).unwrap();
-    let (found, heard) = std::sync::mpsc::channel();
+    let (found, received) = std::sync::mpsc::channel();
     std::thread::spawn(move || found.send((unusable(&directory), directory)));
-    let (reason, directory) = heard.recv_timeout(Duration::from_secs(10)).unwrap();
+    let (reason, directory) = received.recv_timeout(Duration::from_secs(10)).unwrap();
     assert_eq!(reason, "not a regular file");
     let aside = place.path().join("discovery.json.corrupt");
     let error = StateDirectory::open(&aside).unwrap_err();
@@ -217,24 +217,30 @@ fn two_agents_do_not_share_a_directory() {
 fn a_failed_write_of_the_state_is_counted_and_retried() {
     let (place, directory) = directory();
     // A file cannot replace a directory.
-    let obstacle = place.path().join(NEW_FILE);
+    let obstacle = place.path().join(NEW_STATE_FILE);
     fs::create_dir(&obstacle).unwrap();
     let mut keeper = StateWriter::start(Arc::new(directory)).unwrap();
     let start = Instant::now();
-    assert!(keeper.wants(0, start));
+    assert!(keeper.is_write_due(0, start));
     keeper.keep(Memory::default(), 0, start);
     while keeper.facts().failures == 0 {
         assert!(start.elapsed() < Duration::from_secs(10));
         std::thread::yield_now();
     }
     fs::remove_dir(obstacle).unwrap();
-    assert!(!keeper.wants(0, start + 2 * PERIOD), "nothing has changed");
     assert!(
-        keeper.wants(0, start + RETRY_INTERVAL),
+        !keeper.is_write_due(0, start + 2 * WRITE_INTERVAL),
+        "nothing has changed"
+    );
+    assert!(
+        keeper.is_write_due(0, start + RETRY_INTERVAL),
         "there may be room again"
     );
-    assert!(!keeper.wants(1, start + PERIOD / 2), "it is too soon");
-    assert!(keeper.wants(1, start + PERIOD));
+    assert!(
+        !keeper.is_write_due(1, start + WRITE_INTERVAL / 2),
+        "it is too soon"
+    );
+    assert!(keeper.is_write_due(1, start + WRITE_INTERVAL));
     assert_eq!(keeper.facts().writes, 0);
     keeper.finish(Memory::default());
     let directory = StateDirectory::open(place.path()).unwrap();
@@ -262,7 +268,7 @@ fn a_hanging_file_system_delays_neither_the_agent_nor_its_end() {
 #[test]
 fn a_state_file_beyond_the_maximum_size_is_moved_aside() {
     let (place, directory) = directory();
-    let file = File::create(place.path().join(FILE)).unwrap();
+    let file = File::create(place.path().join(STATE_FILE)).unwrap();
     file.set_len(MAX_BYTES + 1).unwrap();
     println!("{}", unusable(&directory));
 }

@@ -81,7 +81,7 @@ impl Backlog {
     }
 
     /// Evicts the least important entry, if any.
-    pub(super) fn sacrifice(&mut self) -> Option<Item> {
+    pub(super) fn evict_least_important(&mut self) -> Option<Item> {
         let time = self.times.front().copied();
         let place = time.or_else(|| {
             // Among topics with equal bytes, the one with the oldest entry is chosen.

@@ -19,9 +19,9 @@ use ros2probe_model::facts::dispatch::{Missed, MissedReason, Sample};
 use ros2probe_model::facts::selection::SampleRequest;
 
 /// Memory of a queued entry besides its payload, in bytes.
-const OVERHEAD: usize = 256;
+const ENTRY_OVERHEAD: usize = 256;
 /// Interval at which a source that waits for a reader checks for the end of the agent.
-const LOOK: Duration = Duration::from_millis(50);
+const STOP_CHECK_INTERVAL: Duration = Duration::from_millis(50);
 
 /// One subscription, shared by both ends.
 #[derive(Debug)]
@@ -35,7 +35,7 @@ pub(super) struct Channel {
     /// Notification of asynchronous and of blocking readers.
     readable: Notify,
     changed: Condvar,
-    in_force: AtomicBool,
+    is_applied: AtomicBool,
     known: Notify,
 }
 
@@ -114,7 +114,7 @@ impl Channel {
             bytes: AtomicUsize::new(0),
             readable: Notify::new(),
             changed: Condvar::new(),
-            in_force: AtomicBool::new(false),
+            is_applied: AtomicBool::new(false),
             known: Notify::new(),
         }
     }
@@ -161,22 +161,22 @@ impl Channel {
         }
     }
 
-    /// Removes and returns the topics whose retained samples are due, if `in_force` is the latest
-    /// selection.
-    pub(super) fn take_fresh(&self, in_force: &Arc<Selection>) -> Option<Arc<Selection>> {
+    /// Removes and returns the topics whose retained samples are due, if `wait_applied` is the
+    /// latest selection.
+    pub(super) fn take_newly_selected(&self, in_force: &Arc<Selection>) -> Option<Arc<Selection>> {
         let mut wanted = self.wanted();
         let is_latest = Arc::ptr_eq(&wanted.selection, in_force);
         is_latest.then(|| wanted.fresh.take()).flatten()
     }
 
     pub(super) fn set_in_force(&self) {
-        if !self.in_force.swap(true, Ordering::Release) {
+        if !self.is_applied.swap(true, Ordering::Release) {
             self.known.notify_one();
         }
     }
 
-    pub(super) async fn in_force(&self) {
-        if !self.in_force.load(Ordering::Acquire) {
+    pub(super) async fn wait_applied(&self) {
+        if !self.is_applied.load(Ordering::Acquire) {
             self.known.notified().await;
         }
     }
@@ -189,7 +189,7 @@ impl Channel {
         charge: Option<&Arc<QueuedBytes>>,
         stop: &CancellationToken,
     ) {
-        let bytes = OVERHEAD + sample.payload.as_ref().map_or(0, bytes::Bytes::len);
+        let bytes = ENTRY_OVERHEAD + sample.payload.as_ref().map_or(0, bytes::Bytes::len);
         let mut queue = self.wait_for_room(bytes, stop);
         let item = Item::Sample(Arc::clone(sample));
         self.push(&mut queue, item, bytes, charge.map(Arc::clone));
@@ -197,7 +197,7 @@ impl Channel {
 
     /// Reports samples that will not be delivered.
     pub(super) fn miss(&self, missed: Missed, stop: &CancellationToken) {
-        let mut queue = self.wait_for_room(OVERHEAD, stop);
+        let mut queue = self.wait_for_room(ENTRY_OVERHEAD, stop);
         if let Some(Item::Missed(last)) = queue.waiting.last_mut()
             && follows(last, &missed)
         {
@@ -205,19 +205,19 @@ impl Channel {
             last.samples += missed.samples;
             return;
         }
-        self.push(&mut queue, Item::Missed(missed), OVERHEAD, None);
+        self.push(&mut queue, Item::Missed(missed), ENTRY_OVERHEAD, None);
     }
 
     /// Reports that all items up to `now` are in the queue.
     pub(super) fn clock(&self, now: Timestamp, stop: &CancellationToken) {
-        let mut queue = self.wait_for_room(OVERHEAD, stop);
+        let mut queue = self.wait_for_room(ENTRY_OVERHEAD, stop);
         if let Some(Item::Clock(last)) = queue.waiting.last_mut()
             && self.request.overflow == Overflow::DropOldest
         {
             *last = now.max(*last);
             return;
         }
-        self.push(&mut queue, Item::Clock(now), OVERHEAD, None);
+        self.push(&mut queue, Item::Clock(now), ENTRY_OVERHEAD, None);
     }
 
     /// Reports the end of the stream.
@@ -324,7 +324,7 @@ impl Channel {
             && !stop.is_cancelled()
         {
             self.wake();
-            let waited = self.changed.wait_timeout(queue, LOOK);
+            let waited = self.changed.wait_timeout(queue, STOP_CHECK_INTERVAL);
             (queue, _) = waited.unwrap_or_else(PoisonError::into_inner);
         }
         queue
@@ -344,7 +344,7 @@ impl Channel {
 
     /// Evicts an entry. Returns `false` if the queue is empty.
     fn drop_one(&self, queue: &mut Queue) -> bool {
-        let Some(item) = queue.waiting.sacrifice() else {
+        let Some(item) = queue.waiting.evict_least_important() else {
             return false;
         };
         self.bytes.store(queue.waiting.bytes(), Ordering::Relaxed);

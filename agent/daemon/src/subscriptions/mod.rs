@@ -119,7 +119,7 @@ pub enum NextItem {
 pub struct Subscriptions {
     channels: ArcSwap<Vec<Arc<Channel>>>,
     /// Locked while `channels` changes.
-    changing: Mutex<Opened>,
+    channels_lock: Mutex<Opened>,
     /// Requests of watches for the last messages of their topics.
     retained: ArcSwap<Vec<SampleRequest>>,
     /// Latest requests that the capture thread has not read yet.
@@ -130,7 +130,7 @@ pub struct Subscriptions {
     stop: CancellationToken,
     /// Bytes in all queues; each sample counts once.
     queued: Arc<AtomicUsize>,
-    given: AtomicU64,
+    enqueued: AtomicU64,
     missed: [AtomicU64; MissedReason::ALL.len()],
     refused: AtomicU64,
     crowded_out: AtomicU64,
@@ -157,27 +157,27 @@ impl Subscriptions {
     pub fn new(latest: Arc<SnapshotCell>, caps: Caps, stop: CancellationToken) -> Self {
         Self {
             channels: ArcSwap::default(),
-            changing: Mutex::default(),
+            channels_lock: Mutex::default(),
             retained: ArcSwap::default(),
             unread: ArcSwapOption::default(),
             latest,
             caps,
             stop,
             queued: Arc::default(),
-            given: AtomicU64::new(0),
+            enqueued: AtomicU64::new(0),
             missed: Default::default(),
             refused: AtomicU64::new(0),
             crowded_out: AtomicU64::new(0),
         }
     }
 
-    /// Opens a subscription; see [`Subscription::in_force`].
+    /// Opens a subscription; see [`Subscription::wait_applied`].
     ///
     /// # Errors
     ///
     /// Fails if there are too many subscriptions or too many patterns.
     pub fn open(self: &Arc<Self>, request: Request) -> Result<Subscription, Refused> {
-        let mut opened = self.changing();
+        let mut opened = self.lock_channels();
         let channels = self.channels.load();
         if channels.len() >= self.caps.subscriptions {
             self.refused.fetch_add(1, Ordering::Relaxed);
@@ -219,7 +219,7 @@ impl Subscriptions {
         SubscriptionFacts {
             open: self.channels.load().len(),
             refused: self.refused.load(Ordering::Relaxed),
-            given: self.given.load(Ordering::Relaxed),
+            enqueued: self.enqueued.load(Ordering::Relaxed),
             missed: missed.map(|count| count.load(Ordering::Relaxed)),
             crowded_out: self.crowded_out.load(Ordering::Relaxed),
             queued_bytes: self.queued.load(Ordering::Relaxed),
@@ -241,7 +241,7 @@ impl Subscriptions {
 
     /// For the capture thread: requests the messages that watches with `retain: last` need.
     pub fn retain(&self, watches: &[Arc<Watch>]) {
-        let changing = self.changing();
+        let changing = self.lock_channels();
         let retained = Arc::new(retained::sample_requests(watches));
         let is_idle = retained.is_empty();
         let before = self.retained.swap(retained);
@@ -254,7 +254,7 @@ impl Subscriptions {
     /// For the capture thread: handles requests that are now in force in the model and the kernel.
     /// Readers first receive the last messages of topics that are new to them, which `latched`
     /// returns.
-    pub fn in_force(
+    pub fn confirm_applied(
         &self,
         sample_requests: &[SampleRequest],
         mut latched: impl FnMut(&SampleRequest) -> Vec<Arc<Sample>>,
@@ -264,7 +264,7 @@ impl Subscriptions {
             let Some(request) = requests.find(|request| request.id == channel.id()) else {
                 continue;
             };
-            let Some(fresh) = channel.take_fresh(&request.selection) else {
+            let Some(fresh) = channel.take_newly_selected(&request.selection) else {
                 continue;
             };
             if channel.depth() == Depth::Payloads {
@@ -273,7 +273,7 @@ impl Subscriptions {
                     ..request.clone()
                 };
                 for sample in latched(&fresh) {
-                    self.given.fetch_add(1, Ordering::Relaxed);
+                    self.enqueued.fetch_add(1, Ordering::Relaxed);
                     channel.sample(&sample, None, &self.stop);
                 }
                 channel.wake();
@@ -281,8 +281,8 @@ impl Subscriptions {
         }
     }
 
-    /// Marks these requests as in force. The capture thread calls this once it captures every message
-    /// for them.
+    /// Marks these requests as in force. The capture thread calls this once it captures every
+    /// message for them.
     pub fn confirm(&self, sample_requests: &[SampleRequest]) {
         for channel in self.channels.load().iter() {
             if sample_requests
@@ -304,7 +304,7 @@ impl Subscriptions {
             match outcome {
                 SampleOutcome::Sample(sample) => self.sample(&channels, &to, &sample),
                 SampleOutcome::Missed(missed) => {
-                    for channel in addressed(&channels, &to) {
+                    for channel in recipients(&channels, &to) {
                         self.count_missed(missed.reason, missed.samples);
                         channel.miss(missed.clone(), &self.stop);
                     }
@@ -331,7 +331,7 @@ impl Subscriptions {
 
     /// For the capture thread: ends all subscriptions.
     pub fn end(&self, reason: &'static str) {
-        let mut opened = self.changing();
+        let mut opened = self.lock_channels();
         opened.ended = Some(reason);
         for channel in self.channels.load().iter() {
             channel.end(reason);
@@ -341,8 +341,8 @@ impl Subscriptions {
     fn sample(&self, channels: &[Arc<Channel>], to: &[u64], sample: &Arc<Sample>) {
         let mut arrival = None;
         let mut charge = None;
-        for channel in addressed(channels, to) {
-            self.given.fetch_add(1, Ordering::Relaxed);
+        for channel in recipients(channels, to) {
+            self.enqueued.fetch_add(1, Ordering::Relaxed);
             let wants_payload = channel.depth() == Depth::Payloads;
             let sample = match &sample.payload {
                 Some(_) if !wants_payload => arrival.get_or_insert_with(|| {
@@ -387,7 +387,7 @@ impl Subscriptions {
     }
 
     fn close(&self, id: u64) {
-        let changing = self.changing();
+        let changing = self.lock_channels();
         let mut channels = self.channels.load().to_vec();
         channels.retain(|channel| channel.id() != id);
         self.change(channels);
@@ -395,7 +395,7 @@ impl Subscriptions {
         self.latest.bell().ring();
     }
 
-    /// Replaces the open channels. The caller holds `changing`.
+    /// Replaces the open channels. The caller holds `lock_channels`.
     fn change(&self, channels: Vec<Arc<Channel>>) {
         let sample_requests = channels.iter().map(|channel| channel.request());
         let retained = self.retained.load();
@@ -404,8 +404,10 @@ impl Subscriptions {
         self.unread.store(Some(Arc::new(sample_requests)));
     }
 
-    fn changing(&self) -> std::sync::MutexGuard<'_, Opened> {
-        self.changing.lock().unwrap_or_else(PoisonError::into_inner)
+    fn lock_channels(&self) -> std::sync::MutexGuard<'_, Opened> {
+        self.channels_lock
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -414,9 +416,9 @@ impl Subscriptions {
 pub struct Begin(Arc<Channel>);
 
 impl Begin {
-    /// Waits like [`Subscription::in_force`]. Only one task may wait at a time.
+    /// Waits like [`Subscription::wait_applied`]. Only one task may wait at a time.
     pub async fn in_force(&self, timeout: Duration) -> bool {
-        let known = self.0.in_force();
+        let known = self.0.wait_applied();
         tokio::time::timeout(timeout, known).await.is_ok()
     }
 }
@@ -457,7 +459,7 @@ impl Subscription {
 
     /// Replaces the selection by `topics`. The retained samples of the topics in `fresh` follow.
     pub fn select(&self, topics: BTreeSet<TopicKey>, fresh: BTreeSet<TopicKey>) {
-        let changing = self.all.changing();
+        let changing = self.all.lock_channels();
         self.channel.select(topics, fresh);
         self.all.change(self.all.channels.load().to_vec());
         drop(changing);
@@ -473,7 +475,7 @@ impl Drop for Subscription {
     }
 }
 
-fn addressed<'a>(
+fn recipients<'a>(
     channels: &'a [Arc<Channel>],
     to: &'a [u64],
 ) -> impl Iterator<Item = &'a Arc<Channel>> {

@@ -7,12 +7,12 @@ use crate::config::{Retain, Watch};
 use ros2probe_model::facts::selection::{Depth, SampleRequest, Selection};
 
 /// First id of the requests of watches; lower ids belong to readers.
-const FIRST: u64 = 1 << 63;
+const FIRST_REQUEST_ID: u64 = 1 << 63;
 
 /// Returns the requests of these watches.
 pub(super) fn sample_requests(watches: &[Arc<Watch>]) -> Vec<SampleRequest> {
     let asking = watches.iter().filter(|watch| watch.retain == Retain::Last);
-    let sample_requests = asking.zip(FIRST..).filter_map(|(watch, id)| {
+    let sample_requests = asking.zip(FIRST_REQUEST_ID..).filter_map(|(watch, id)| {
         Some(SampleRequest {
             id,
             // The configuration's check has accepted the pattern.
@@ -38,7 +38,10 @@ mod tests {
         let [request] = &sample_requests(&watches)[..] else {
             panic!("one watch asks")
         };
-        assert_eq!((request.id, request.depth), (FIRST, Depth::Payloads));
+        assert_eq!(
+            (request.id, request.depth),
+            (FIRST_REQUEST_ID, Depth::Payloads)
+        );
         assert!(request.selection.globs().eq(["/maps/**"]));
     }
 }

@@ -57,11 +57,11 @@ fn sample_of(topic: &str, number: u64, payload: Option<usize>) -> Arc<Sample> {
     })
 }
 
-fn given(to: &[u64], number: u64, payload: Option<usize>) -> Dispatch {
-    given_of("points", to, number, payload)
+fn enqueued(to: &[u64], number: u64, payload: Option<usize>) -> Dispatch {
+    enqueued_of("points", to, number, payload)
 }
 
-fn given_of(topic: &str, to: &[u64], number: u64, payload: Option<usize>) -> Dispatch {
+fn enqueued_of(topic: &str, to: &[u64], number: u64, payload: Option<usize>) -> Dispatch {
     Dispatch {
         to: to.into(),
         outcome: SampleOutcome::Sample(sample_of(topic, number, payload)),
@@ -87,7 +87,7 @@ fn each_reader_gets_its_samples_and_payloads_only_on_request() {
     let sample_requests = all.take_changed().unwrap();
     assert_eq!(sample_requests.len(), 2);
     all.deliver(
-        vec![given(&[1, 2], 1, Some(5)), given(&[2], 2, Some(6))],
+        vec![enqueued(&[1, 2], 1, Some(5)), enqueued(&[2], 2, Some(6))],
         Some(Timestamp(9)),
     );
     assert_eq!(arrivals.try_next(), Some(Item::Sample(sample(1, None))));
@@ -96,7 +96,7 @@ fn each_reader_gets_its_samples_and_payloads_only_on_request() {
     assert_eq!(payloads.try_next(), Some(Item::Sample(sample(1, Some(5)))));
     assert_eq!(all.facts().queued_bytes, 6);
     assert_eq!(payloads.try_next(), Some(Item::Sample(sample(2, Some(6)))));
-    assert_eq!((all.facts().queued_bytes, all.facts().given), (0, 3));
+    assert_eq!((all.facts().queued_bytes, all.facts().enqueued), (0, 3));
 }
 
 #[test]
@@ -106,7 +106,7 @@ fn a_slow_reader_loses_the_oldest_samples_and_receives_their_number_first() {
         .open(request(Depth::Payloads, 4 * 1256, Overflow::DropOldest))
         .unwrap();
     for number in 1..=10 {
-        all.deliver(vec![given(&[1], number, Some(1000))], None);
+        all.deliver(vec![enqueued(&[1], number, Some(1000))], None);
     }
     let Some(Item::Missed(missed)) = slow.try_next() else {
         panic!("nothing was reported");
@@ -125,8 +125,8 @@ fn a_full_queue_drops_the_oldest_samples_of_its_largest_topic() {
         .open(request(Depth::Payloads, 20_000, Overflow::DropOldest))
         .unwrap();
     for number in 1..=10 {
-        let clouds = given(&[1], number, Some(4000));
-        let small = given_of("tf", &[1], number, Some(100));
+        let clouds = enqueued(&[1], number, Some(4000));
+        let small = enqueued_of("tf", &[1], number, Some(100));
         all.deliver(vec![small, clouds], Some(Timestamp(number)));
     }
     let mut left: BTreeMap<String, Vec<u64>> = BTreeMap::new();
@@ -162,8 +162,8 @@ fn a_message_larger_than_the_queue_evicts_no_other_message() {
     let mut slow = all
         .open(request(Depth::Payloads, 2000, Overflow::DropOldest))
         .unwrap();
-    all.deliver(vec![given_of("tf", &[1], 1, Some(100))], None);
-    all.deliver(vec![given(&[1], 1, Some(5000))], None);
+    all.deliver(vec![enqueued_of("tf", &[1], 1, Some(100))], None);
+    all.deliver(vec![enqueued(&[1], 1, Some(5000))], None);
     let Some(Item::Missed(missed)) = slow.try_next() else {
         panic!("nothing was reported");
     };
@@ -183,11 +183,11 @@ fn all_queues_together_stay_within_their_cap_and_a_payload_counts_once() {
         .collect();
     let everybody: Vec<u64> = (1..=10).collect();
     for number in 1..=10 {
-        all.deliver(vec![given(&everybody, number, Some(1000))], None);
+        all.deliver(vec![enqueued(&everybody, number, Some(1000))], None);
     }
     assert_eq!(all.facts().queued_bytes, 10_000);
     for number in 11..=100 {
-        all.deliver(vec![given(&everybody, number, Some(1000))], None);
+        all.deliver(vec![enqueued(&everybody, number, Some(1000))], None);
         assert!(all.facts().queued_bytes <= 10_000);
     }
     for reader in &mut readers {
@@ -207,7 +207,7 @@ fn during_a_replay_the_source_waits_for_readers_but_not_for_closed_ones() {
         move || {
             for number in 1..=200 {
                 all.deliver(
-                    vec![given(&[1], number, Some(1000))],
+                    vec![enqueued(&[1], number, Some(1000))],
                     Some(Timestamp(number)),
                 );
             }
@@ -239,7 +239,7 @@ fn a_waiting_source_continues_when_the_agent_ends() {
         let all = Arc::clone(&all);
         move || {
             for number in 1..=10 {
-                all.deliver(vec![given(&[1], number, Some(1000))], None);
+                all.deliver(vec![enqueued(&[1], number, Some(1000))], None);
             }
         }
     });
@@ -253,7 +253,7 @@ fn dropping_a_subscription_ends_its_request_and_allows_another_one() {
     let open = || all.open(request(Depth::Arrivals, 1 << 16, Overflow::DropOldest));
     let mut readers: Vec<_> = (0..4).map(|_| open().unwrap()).collect();
     assert_eq!(open().unwrap_err(), Refused::TooMany(4));
-    all.deliver(vec![given(&[4], 1, Some(1000))], None);
+    all.deliver(vec![enqueued(&[4], 1, Some(1000))], None);
     readers.pop();
     assert_eq!((all.facts().open, all.facts().queued_bytes), (3, 0));
     let sample_requests = all.take_changed().unwrap();
@@ -297,21 +297,21 @@ fn patterns_of_all_subscriptions_together_are_bounded() {
 }
 
 #[tokio::test]
-async fn a_reader_receives_its_items_then_the_end_and_then_none() {
+async fn a_reader_receives_its_items_and_then_the_end() {
     let all = subscriptions(caps());
     let mut reader = all
         .open(request(Depth::Arrivals, 1 << 16, Overflow::DropOldest))
         .unwrap();
     assert!(!reader.in_force(Duration::from_millis(1)).await);
     let requests = all.take_changed().unwrap();
-    all.in_force(&requests, |_| Vec::new());
+    all.confirm_applied(&requests, |_| Vec::new());
     assert!(!reader.in_force(Duration::from_millis(1)).await);
     all.confirm(&requests);
     assert!(reader.in_force(LONG).await);
     let source = std::thread::spawn({
         let all = Arc::clone(&all);
         move || {
-            all.deliver(vec![given(&[1], 1, None)], Some(Timestamp(3)));
+            all.deliver(vec![enqueued(&[1], 1, None)], Some(Timestamp(3)));
             all.end("end of capture");
         }
     });

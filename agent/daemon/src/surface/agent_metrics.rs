@@ -19,7 +19,7 @@ use crate::snapshot_cell::State;
 use ros2probe_metrics::catalogue as metric;
 use ros2probe_metrics::metric_sink::{Label, MetricSink};
 use ros2probe_metrics::otlp::{Exports, Outcome, Reason};
-use ros2probe_metrics::remote_write::{Fate, Figures, Request};
+use ros2probe_metrics::remote_write::{Figures, Request, SampleFate};
 use ros2probe_model::facts::dispatch::MissedReason;
 
 /// Writes the version, source, sandbox, abilities and readiness of the agent.
@@ -108,7 +108,7 @@ fn shared_memory(sink: &mut MetricSink<'_>, facts: Option<&SharedMemoryFacts>) -
         events.try_for_each(|(event, count)| family.sample(&[Label::Text(event)], *count))
     })?;
     sink.family(&metric::SHM_LOOKS, |family| match facts {
-        Some(facts) => family.sample(&[], facts.looks),
+        Some(facts) => family.sample(&[], facts.polls),
         None => Ok(()),
     })?;
     sink.family(&metric::SHM_CPU, |family| match facts {
@@ -238,7 +238,7 @@ pub(super) fn surface(
     last_scrape: Duration,
     now: Instant,
 ) -> fmt::Result {
-    let age = now.saturating_duration_since(state.agent.at);
+    let age = now.saturating_duration_since(state.agent.collected_at);
     sink.single(&metric::SNAPSHOT_AGE, age.as_secs_f64())?;
     sink.single(&metric::SCRAPE_DURATION, last_scrape.as_secs_f64())?;
     sink.single(&metric::RELOAD_SUCCESSFUL, reload.successful)?;
@@ -254,7 +254,7 @@ pub(super) fn subscriptions(sink: &mut MetricSink<'_>, state: &State) -> fmt::Re
     let facts = &state.agent.subscriptions;
     sink.single(&metric::SUBSCRIPTIONS, facts.open)?;
     sink.single(&metric::SUBSCRIPTIONS_REFUSED, facts.refused)?;
-    sink.single(&metric::SAMPLES_GIVEN, facts.given)?;
+    sink.single(&metric::SAMPLES_GIVEN, facts.enqueued)?;
     sink.family(&metric::SAMPLES_MISSED, |family| {
         let mut missed = MissedReason::ALL.into_iter().zip(facts.missed);
         missed.try_for_each(|(reason, count)| family.sample(&[Label::Text(reason.label())], count))
@@ -334,7 +334,7 @@ pub(super) fn recordings(sink: &mut MetricSink<'_>, figures: &RecordingFigures) 
     let families: [(_, Read); 7] = [
         (&metric::SNAPSHOT_MESSAGES, |figures| figures.messages),
         (&metric::SNAPSHOT_BYTES, |figures| figures.bytes),
-        (&metric::SNAPSHOT_CROWDED_OUT, |figures| figures.crowded_out),
+        (&metric::SNAPSHOT_CROWDED_OUT, |figures| figures.evicted),
         (&metric::SNAPSHOTS_WRITTEN, |figures| figures.written),
         (&metric::SNAPSHOTS_FAILED, |figures| figures.failed),
         (&metric::SNAPSHOTS_SUPPRESSED, |figures| figures.suppressed),
@@ -384,7 +384,7 @@ pub(super) fn remote_write(sink: &mut MetricSink<'_>, figures: &Figures) -> fmt:
     sink.family(&metric::REMOTE_WRITE_SAMPLES, |family| {
         let mut samples = figures
             .into_iter()
-            .flat_map(|figures| Fate::ALL.map(|fate| (fate.label(), figures.samples(fate))));
+            .flat_map(|figures| SampleFate::ALL.map(|fate| (fate.label(), figures.samples(fate))));
         samples.try_for_each(|(label, count)| family.sample(&[Label::Text(label)], count))
     })?;
     let numbers = [
@@ -400,7 +400,7 @@ pub(super) fn remote_write(sink: &mut MetricSink<'_>, figures: &Figures) -> fmt:
         })?;
     }
     sink.family(&metric::REMOTE_WRITE_BEHIND, |family| {
-        figures.map_or(Ok(()), |figures| family.sample(&[], figures.behind()))
+        figures.map_or(Ok(()), |figures| family.sample(&[], figures.lag_seconds()))
     })
 }
 

@@ -19,7 +19,7 @@ use tokio::sync::Semaphore;
 
 /// A hash without a known password. It makes the check of an unknown name as slow as that of a
 /// known name.
-const NOBODY: &str = "$2y$10$QOauhQNbBCuQDKes6eFzPeMqBSjb7Mr5DUmpZ/VcEd00UAV/LDeSi";
+const UNKNOWN_USER_HASH: &str = "$2y$10$QOauhQNbBCuQDKes6eFzPeMqBSjb7Mr5DUmpZ/VcEd00UAV/LDeSi";
 
 /// Checks the credentials of requests.
 #[derive(Debug)]
@@ -28,7 +28,7 @@ pub(super) struct Gate {
     users: BTreeMap<String, String>,
     /// Correct passwords by name.
     known: Mutex<BTreeMap<String, Vec<u8>>>,
-    turn: Semaphore,
+    hash_permit: Semaphore,
 }
 
 impl Gate {
@@ -36,23 +36,23 @@ impl Gate {
         Self {
             users,
             known: Mutex::default(),
-            turn: Semaphore::new(1),
+            hash_permit: Semaphore::new(1),
         }
     }
 
-    async fn lets_in(&self, headers: &HeaderMap) -> bool {
+    async fn is_authorized(&self, headers: &HeaderMap) -> bool {
         let Some((name, password)) = credentials(headers) else {
             return false;
         };
-        if self.remembers(&name, &password) {
+        if self.is_cached(&name, &password) {
             return true;
         }
         let hash = self.users.get(&name);
         let is_known = hash.is_some();
-        let hash = hash.map_or(NOBODY, String::as_str).to_owned();
+        let hash = hash.map_or(UNKNOWN_USER_HASH, String::as_str).to_owned();
         let offered = password.clone();
         // The semaphore is never closed.
-        let _turn = self.turn.acquire().await;
+        let _turn = self.hash_permit.acquire().await;
         let verified = tokio::task::spawn_blocking(move || bcrypt::verify(offered, &hash));
         let is_right = matches!(verified.await, Ok(Ok(true))) && is_known;
         if is_right {
@@ -62,7 +62,7 @@ impl Gate {
         is_right
     }
 
-    fn remembers(&self, name: &str, password: &[u8]) -> bool {
+    fn is_cached(&self, name: &str, password: &[u8]) -> bool {
         let known = self.known.lock().unwrap_or_else(PoisonError::into_inner);
         let right = known.get(name);
         right.is_some_and(|right| right.as_slice().ct_eq(password).into())
@@ -71,7 +71,7 @@ impl Gate {
 
 /// Refuses requests without valid credentials.
 pub(super) async fn guard(State(gate): State<Arc<Gate>>, request: Request, next: Next) -> Response {
-    if gate.lets_in(request.headers()).await {
+    if gate.is_authorized(request.headers()).await {
         return next.run(request).await;
     }
     let challenge = [(WWW_AUTHENTICATE, "Basic")];
@@ -109,10 +109,10 @@ mod tests {
         let hash = bcrypt::hash("open sesame", 4).unwrap();
         let users = [("alice".to_owned(), hash)];
         let gate = Gate::new(users.into_iter().collect());
-        assert!(!gate.remembers("alice", b"open sesame"));
-        assert!(gate.lets_in(&basic("alice:open sesame")).await);
-        assert!(gate.remembers("alice", b"open sesame"));
-        assert!(gate.lets_in(&basic("alice:open sesame")).await);
+        assert!(!gate.is_cached("alice", b"open sesame"));
+        assert!(gate.is_authorized(&basic("alice:open sesame")).await);
+        assert!(gate.is_cached("alice", b"open sesame"));
+        assert!(gate.is_authorized(&basic("alice:open sesame")).await);
         for wrong in [
             "alice:open sesam",
             "alice:",
@@ -121,7 +121,7 @@ mod tests {
             ":open sesame",
             "",
         ] {
-            assert!(!gate.lets_in(&basic(wrong)).await, "{wrong}");
+            assert!(!gate.is_authorized(&basic(wrong)).await, "{wrong}");
         }
         for wrong in [
             "",
@@ -133,11 +133,11 @@ mod tests {
         ] {
             if let Ok(value) = wrong.parse() {
                 let headers = [(AUTHORIZATION, value)].into_iter().collect();
-                assert!(!gate.lets_in(&headers).await, "{wrong}");
+                assert!(!gate.is_authorized(&headers).await, "{wrong}");
             }
         }
-        assert!(!gate.lets_in(&HeaderMap::new()).await);
+        assert!(!gate.is_authorized(&HeaderMap::new()).await);
         assert_eq!(gate.known.lock().unwrap().len(), 1);
-        assert!(bcrypt::verify("x", NOBODY).is_ok());
+        assert!(bcrypt::verify("x", UNKNOWN_USER_HASH).is_ok());
     }
 }

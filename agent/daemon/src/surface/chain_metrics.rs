@@ -28,8 +28,8 @@ pub(super) fn chains(
     settings: &Settings,
     has_traces: bool,
 ) -> fmt::Result {
-    let chains = shown(&snapshot.chains.chains);
-    let whole = whole(snapshot, &chains);
+    let chains = busiest_per_ends(&snapshot.chains.chains);
+    let whole = chain_figures(snapshot, &chains);
     let of_chains = [
         &metric::CHAIN_LATENCY,
         &metric::CHAIN_P50,
@@ -89,7 +89,7 @@ fn write<const LABELS: usize>(
 }
 
 /// Returns one chain for each pair of ends: the chain with the most messages.
-fn shown(chains: &[ChainFacts]) -> Vec<&ChainFacts> {
+fn busiest_per_ends(chains: &[ChainFacts]) -> Vec<&ChainFacts> {
     let mut sorted: Vec<_> = chains.iter().collect();
     sorted.sort_by_key(|chain| (ends(chain), std::cmp::Reverse(chain.count)));
     sorted.dedup_by_key(|chain| ends(chain));
@@ -106,7 +106,7 @@ fn ends(chain: &ChainFacts) -> impl Ord + '_ {
 }
 
 /// Returns the figures of configured chains and of all other chains.
-fn whole<'a>(snapshot: &'a Snapshot, chains: &[&'a ChainFacts]) -> Vec<Figures<'a, 4>> {
+fn chain_figures<'a>(snapshot: &'a Snapshot, chains: &[&'a ChainFacts]) -> Vec<Figures<'a, 4>> {
     let configured = snapshot.chains.expected.iter().filter_map(of_expected);
     let mut all: Vec<_> = configured.collect();
     let is_configured = |chain: &ChainFacts| {

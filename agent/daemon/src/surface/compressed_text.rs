@@ -15,7 +15,7 @@ use lz4_flex::block::{compress_prepend_size, decompress_size_prepended};
 use super::large_responses::Reservation;
 
 /// Approximate size of a piece in bytes, as it is sent.
-const PIECE: usize = 64 << 10;
+const PIECE_BYTES: usize = 64 << 10;
 
 /// Encoding of the text for the client.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -65,12 +65,12 @@ impl TextCompressor {
     /// # Errors
     /// Never fails, because it writes to memory.
     pub(super) fn write(&mut self, text: &[u8]) -> io::Result<()> {
-        for part in text.chunks(PIECE) {
+        for part in text.chunks(PIECE_BYTES) {
             match &mut self.form {
                 Form::Plain(rest) => rest.extend_from_slice(part),
                 Form::Gzip(encoder) => encoder.write_all(part)?,
             }
-            self.pack(PIECE);
+            self.compress_piece(PIECE_BYTES);
         }
         Ok(())
     }
@@ -87,7 +87,7 @@ impl TextCompressor {
                 Encoding::Gzip
             }
         };
-        self.pack(1);
+        self.compress_piece(1);
         Ok(CompressedText {
             encoding,
             pieces: self.pieces,
@@ -96,7 +96,7 @@ impl TextCompressor {
     }
 
     /// Completes a piece if at least this many bytes are pending.
-    fn pack(&mut self, least: usize) {
+    fn compress_piece(&mut self, least: usize) {
         let rest = match &mut self.form {
             Form::Plain(rest) => rest,
             Form::Gzip(encoder) => encoder.get_mut(),
@@ -139,7 +139,7 @@ impl CompressedText {
     pub(super) fn into_body(self, reservation: Option<Reservation>) -> Body {
         let encoding = self.encoding;
         let pieces = self.pieces.into_iter().map(move |piece| {
-            if reservation.as_ref().is_some_and(Reservation::is_given_up) {
+            if reservation.as_ref().is_some_and(Reservation::is_revoked) {
                 return Err(io::Error::other("read too slowly while others waited"));
             }
             match encoding {

@@ -18,26 +18,26 @@ use crate::limit_facts::Slot;
 
 /// A connection is closed after this time without a request, and a stream after this time without a
 /// successful write.
-const IDLE: Duration = Duration::from_secs(75);
+const IDLE_TIMEOUT: Duration = Duration::from_secs(75);
 /// Maximum time from the first to the last byte of a request.
-const REQUEST: Duration = Duration::from_secs(10);
-/// A client must read [`LEAST`] bytes of a complete answer within this time.
-const PROGRESS: Duration = Duration::from_secs(10);
-const LEAST: usize = 64 << 10;
+const REQUEST_TIMEOUT: Duration = Duration::from_secs(10);
+/// A client must read [`MIN_PROGRESS_BYTES`] bytes of a complete answer within this time.
+const PROGRESS_TIMEOUT: Duration = Duration::from_secs(10);
+const MIN_PROGRESS_BYTES: usize = 64 << 10;
 /// An agent that acts this late after a deadline had no CPU time.
-const LATE: Duration = Duration::from_secs(1);
-/// Maximum number of bytes of unfinished requests per listener, in addition to [`FREE`] per
-/// connection.
-const UNFINISHED: usize = 256 << 10;
+const MAX_TIMER_DELAY: Duration = Duration::from_secs(1);
+/// Maximum number of bytes of unfinished requests per listener, in addition to [`UNCHARGED_BYTES`]
+/// per connection.
+const MAX_UNFINISHED_BYTES: usize = 256 << 10;
 /// Number of bytes of an unfinished request that every connection may use.
-const FREE: usize = 4 << 10;
+const UNCHARGED_BYTES: usize = 4 << 10;
 
 /// The connections of one listener.
 #[derive(Debug, Default)]
 pub(super) struct Connections {
     connections: Mutex<Vec<Arc<ConnectionState>>>,
     unfinished: AtomicUsize,
-    left: Notify,
+    closed: Notify,
 }
 
 /// Progress of one connection; shared by its stream and its request handler.
@@ -98,7 +98,7 @@ impl Connections {
             stream,
             state,
             connections: Arc::clone(self),
-            deadline: Box::pin(sleep_until(Instant::now() + IDLE)),
+            deadline: Box::pin(sleep_until(Instant::now() + IDLE_TIMEOUT)),
             slot: Some(slot),
         }
     }
@@ -129,19 +129,19 @@ impl Connections {
     }
 
     /// Waits until a connection has been closed.
-    pub(super) async fn left(&self) {
-        self.left.notified().await;
+    pub(super) async fn wait_closed(&self) {
+        self.closed.notified().await;
     }
 
     /// Counts bytes of an unfinished request; returns false if they exceed the limit.
-    fn hold(&self, bytes: usize) -> bool {
-        let more = |held: usize| Some(held + bytes).filter(|held| *held <= UNFINISHED);
+    fn charge(&self, bytes: usize) -> bool {
+        let more = |held: usize| Some(held + bytes).filter(|held| *held <= MAX_UNFINISHED_BYTES);
         let unfinished = &self.unfinished;
         let held = unfinished.fetch_update(Ordering::Relaxed, Ordering::Relaxed, more);
         held.is_ok()
     }
 
-    fn release(&self, bytes: usize) {
+    fn discharge(&self, bytes: usize) {
         self.unfinished.fetch_sub(bytes, Ordering::Relaxed);
     }
 
@@ -171,7 +171,7 @@ impl ConnectionState {
     pub(super) fn requested(&self, is_whole: bool) {
         let mut progress = self.lock();
         if is_whole {
-            progress.enter(Phase::Working);
+            progress.set_phase(Phase::Working);
         } else {
             // Head and body share one time limit.
             progress.phase = Phase::Receiving;
@@ -182,23 +182,23 @@ impl ConnectionState {
     pub(super) fn received(&self) {
         let mut progress = self.lock();
         if progress.phase == Phase::Receiving {
-            progress.enter(Phase::Working);
+            progress.set_phase(Phase::Working);
         }
     }
 
     /// Records that the answer begins. It is a stream unless `is_whole`.
-    pub(super) fn answers(&self, is_whole: bool) {
+    pub(super) fn begin_answer(&self, is_whole: bool) {
         let phase = if is_whole {
             Phase::Answering
         } else {
             Phase::Streaming
         };
-        self.lock().enter(phase);
+        self.lock().set_phase(phase);
     }
 
     /// Records that the HTTP server has finished with the answer.
     pub(super) fn answered(&self) {
-        self.lock().enter(Phase::Waiting);
+        self.lock().set_phase(Phase::Waiting);
     }
 
     /// Returns whether no request is in progress.
@@ -218,7 +218,7 @@ impl ConnectionState {
 }
 
 impl Progress {
-    fn enter(&mut self, phase: Phase) {
+    fn set_phase(&mut self, phase: Phase) {
         self.phase = phase;
         self.since = Instant::now();
         if phase == Phase::Waiting {
@@ -231,12 +231,12 @@ impl Progress {
         if let Some((since, _)) = self.stalled
             && self.phase != Phase::Streaming
         {
-            return since + PROGRESS;
+            return since + PROGRESS_TIMEOUT;
         }
         match self.phase {
-            Phase::Waiting if self.read == 0 => self.since + IDLE,
-            Phase::Waiting | Phase::Receiving => self.since + REQUEST,
-            Phase::Working | Phase::Answering | Phase::Streaming => self.since + IDLE,
+            Phase::Waiting if self.read == 0 => self.since + IDLE_TIMEOUT,
+            Phase::Waiting | Phase::Receiving => self.since + REQUEST_TIMEOUT,
+            Phase::Working | Phase::Answering | Phase::Streaming => self.since + IDLE_TIMEOUT,
         }
     }
 }
@@ -251,7 +251,7 @@ impl<S> Connection<S> {
     }
 
     /// Returns an error after the deadline, otherwise `Pending`.
-    fn overdue<T>(&mut self, context: &mut Context<'_>) -> Poll<io::Result<T>> {
+    fn poll_deadline<T>(&mut self, context: &mut Context<'_>) -> Poll<io::Result<T>> {
         let deadline = self.state.lock().deadline();
         if self.deadline.deadline() != deadline {
             self.deadline.as_mut().reset(deadline);
@@ -274,9 +274,9 @@ impl<S> Connection<S> {
         }
         progress.read += bytes;
         progress.was_empty = false;
-        let beyond = progress.read.saturating_sub(FREE);
+        let beyond = progress.read.saturating_sub(UNCHARGED_BYTES);
         let fresh = beyond.saturating_sub(progress.counted);
-        if !self.connections.hold(fresh) {
+        if !self.connections.charge(fresh) {
             return Err(io::Error::other("too many bytes of unfinished requests"));
         }
         progress.counted += fresh;
@@ -290,22 +290,22 @@ impl<S> Connection<S> {
         let mut progress = self.state.lock();
         // The request has been processed.
         self.connections
-            .release(std::mem::take(&mut progress.counted));
+            .discharge(std::mem::take(&mut progress.counted));
         if matches!(progress.phase, Phase::Answering | Phase::Streaming) {
             progress.since = now;
         }
         if let Some((since, taken)) = &mut progress.stalled {
             *taken += bytes;
-            if *taken >= LEAST {
+            if *taken >= MIN_PROGRESS_BYTES {
                 progress.stalled = None;
-            } else if *since + PROGRESS + LATE <= now {
+            } else if *since + PROGRESS_TIMEOUT + MAX_TIMER_DELAY <= now {
                 // An agent with CPU time would have closed the connection at the deadline.
                 progress.stalled = Some((now, 0));
             }
         }
     }
 
-    fn stalls(&self) {
+    fn note_stall(&self) {
         let mut progress = self.state.lock();
         if progress.stalled.is_none() {
             progress.stalled = Some((Instant::now(), 0));
@@ -315,13 +315,13 @@ impl<S> Connection<S> {
 
 impl<S> Drop for Connection<S> {
     fn drop(&mut self) {
-        self.connections.release(self.state.lock().counted);
+        self.connections.discharge(self.state.lock().counted);
         let mut connections = self.connections.lock();
         connections.retain(|state| !Arc::ptr_eq(state, &self.state));
         drop(connections);
         // A waiting client finds the slot free.
         self.slot = None;
-        self.connections.left.notify_one();
+        self.connections.closed.notify_one();
     }
 }
 
@@ -335,7 +335,7 @@ impl<S: AsyncRead + Unpin> AsyncRead for Connection<S> {
         match Pin::new(&mut self.stream).poll_read(context, buffer) {
             Poll::Pending => {
                 self.state.lock().was_empty = true;
-                self.overdue(context)
+                self.poll_deadline(context)
             }
             Poll::Ready(Ok(())) => {
                 let bytes = buffer.filled().len().saturating_sub(before);
@@ -354,8 +354,8 @@ impl<S: AsyncWrite + Unpin> AsyncWrite for Connection<S> {
     ) -> Poll<io::Result<usize>> {
         match Pin::new(&mut self.stream).poll_write(context, bytes) {
             Poll::Pending => {
-                self.stalls();
-                self.overdue(context)
+                self.note_stall();
+                self.poll_deadline(context)
             }
             Poll::Ready(Ok(written)) => {
                 self.has_written(written);
@@ -442,7 +442,7 @@ mod tests {
             let (_crowd, join) = connections();
             let (mut connection, mut client) = join();
             connection.state().requested(true);
-            connection.state().answers(is_whole);
+            connection.state().begin_answer(is_whole);
             let start = Instant::now();
             let sent = connection.write_all(&[7; 1 << 20]);
             // The client reads 5 KB per second of a complete answer, and nothing of a stream.
@@ -470,7 +470,7 @@ mod tests {
         let (_crowd, join) = connections();
         let (mut connection, mut client) = join();
         connection.state().requested(true);
-        connection.state().answers(true);
+        connection.state().begin_answer(true);
         let reading = tokio::spawn(async move {
             let mut bytes = [0; 2 << 10];
             let mut read = 0;
@@ -490,19 +490,19 @@ mod tests {
         let (_crowd, join) = connections();
         let (mut connection, mut client) = join();
         connection.state().requested(true);
-        connection.state().answers(true);
+        connection.state().begin_answer(true);
         for _ in 0..3 {
             let stopped = connection.write_all(&[7; 2 << 10]).now_or_never();
             assert!(stopped.is_none(), "the buffer is full");
             client.read_exact(&mut [0; 1 << 10]).await.unwrap();
             // The agent gets no CPU time.
-            tokio::time::advance(2 * PROGRESS).await;
+            tokio::time::advance(2 * PROGRESS_TIMEOUT).await;
         }
         assert_eq!(connection.write(&[7; 1 << 10]).await.unwrap(), 1 << 10);
     }
 
     #[tokio::test]
-    async fn large_unfinished_requests_share_a_budget_and_small_ones_need_none() {
+    async fn large_unfinished_requests_share_a_budget_and_small_ones_are_exempt() {
         let (connections, join) = connections();
         let mut large = Vec::new();
         let mut refused = 0;
@@ -516,7 +516,7 @@ mod tests {
             refused += u32::from(connection.read_exact(&mut bytes).await.is_err());
             large.push((connection, sending));
         }
-        assert!(connections.unfinished.load(Ordering::Relaxed) <= UNFINISHED);
+        assert!(connections.unfinished.load(Ordering::Relaxed) <= MAX_UNFINISHED_BYTES);
         assert_eq!(refused, 13, "36 KiB each of 256");
         let (mut small, mut client) = join();
         client.write_all(b"GET /metrics").await.unwrap();

@@ -113,10 +113,10 @@ impl<'a> Deliveries<'a> {
             })?;
         }
         sink.family(&metric::SUBSCRIBER_INFO, |family| self.subscribers(family))?;
-        self.each_received(sink, &metric::SUBSCRIBER_RECEIVED, |got| {
+        self.for_each_received(sink, &metric::SUBSCRIBER_RECEIVED, |got| {
             got.messages.into()
         })?;
-        self.each_received(sink, &metric::SUBSCRIBER_RECEIVED_BYTES, |got| {
+        self.for_each_received(sink, &metric::SUBSCRIBER_RECEIVED_BYTES, |got| {
             got.bytes.into()
         })?;
         sink.family(&metric::SUBSCRIBER_LOST, |family| {
@@ -144,23 +144,23 @@ impl<'a> Deliveries<'a> {
                 }
             })
         })?;
-        self.each_received(sink, &metric::SUBSCRIBER_PENDING, |got| got.open().into())?;
-        self.each_received(sink, &metric::SUBSCRIBER_RECOVERED, |got| {
+        self.for_each_received(sink, &metric::SUBSCRIBER_PENDING, |got| got.open().into())?;
+        self.for_each_received(sink, &metric::SUBSCRIBER_RECOVERED, |got| {
             got.recovered.into()
         })?;
-        self.each_received(sink, &metric::SUBSCRIBER_RECOVERY_SECONDS, |got| {
+        self.for_each_received(sink, &metric::SUBSCRIBER_RECOVERY_SECONDS, |got| {
             got.recovery_seconds.into()
         })?;
-        self.each_received(sink, &metric::SUBSCRIBER_IRRELEVANT, |got| {
+        self.for_each_received(sink, &metric::SUBSCRIBER_IRRELEVANT, |got| {
             got.irrelevant.into()
         })?;
-        self.each_received(sink, &metric::SUBSCRIBER_UNMATCHED, |got| {
+        self.for_each_received(sink, &metric::SUBSCRIBER_UNMATCHED, |got| {
             got.unmatched.into()
         })?;
         self.acknowledgements(sink)
     }
 
-    fn each_received(
+    fn for_each_received(
         &self,
         sink: &mut MetricSink<'_>,
         metric: &'static Metric,

@@ -132,7 +132,7 @@ fn start(address: SocketAddr, interval: u32, more: &str, sources: &MetricSources
 
 /// Returns a snapshot of a managed node, observed from inside its process, whose timer publishes
 /// `/scan` at 20 Hz and takes 4 ms.
-fn seen_inside() -> Snapshot {
+fn inside_snapshot() -> Snapshot {
     let start = 1_795_143_000 * SECOND;
     let mut observer = Observer::new(observer::Settings::default());
     observer.input(Input::Time(Timestamp(start)));
@@ -256,7 +256,7 @@ async fn metrics_of_calls_inside_processes_are_exported_as_on_the_page() {
         }),
         ..AgentFacts::new(SourceKind::Host, Instant::now())
     };
-    sources.latest.publish(seen_inside(), agent);
+    sources.latest.publish(inside_snapshot(), agent);
     let page = Exposition::new(sources.clone()).render(Format::Classic);
     let page = page.unwrap();
     let exporter = start(address, 1, "", &sources);

@@ -11,7 +11,7 @@ use ros2probe_message::{Decoded, Library, Limits, MessageType, Sources, decode};
 use ros2probe_metrics::catalogue::{self, Kind, Metric};
 use ros2probe_metrics::metric_sink::{Label, MetricSink};
 use ros2probe_metrics::stability::Stability;
-use ros2probe_model::derive::robot::fields::BATTERY;
+use ros2probe_model::derive::robot::fields::BATTERY_TYPE;
 use ros2probe_model::facts::names::{TopicName, TypeName};
 use ros2probe_model::report::snapshot::{FieldMessage, Snapshot};
 use tokio::runtime::Handle;
@@ -19,16 +19,16 @@ use tokio::runtime::Handle;
 use crate::config::Extraction;
 
 /// Fields of standard types, each with its metric.
-const STANDARD: [(&str, &str, &Metric); 4] = [
-    (BATTERY, "percentage", &catalogue::BATTERY_CHARGE),
-    (BATTERY, "voltage", &catalogue::BATTERY_VOLTAGE),
-    (BATTERY, "current", &catalogue::BATTERY_CURRENT),
-    (BATTERY, "temperature", &catalogue::BATTERY_TEMPERATURE),
+const STANDARD_FIELDS: [(&str, &str, &Metric); 4] = [
+    (BATTERY_TYPE, "percentage", &catalogue::BATTERY_CHARGE),
+    (BATTERY_TYPE, "voltage", &catalogue::BATTERY_VOLTAGE),
+    (BATTERY_TYPE, "current", &catalogue::BATTERY_CURRENT),
+    (BATTERY_TYPE, "temperature", &catalogue::BATTERY_TEMPERATURE),
 ];
 /// Elements of an array that are kept.
-const ELEMENTS: usize = 1024;
+const MAX_ELEMENTS: usize = 1024;
 /// Time after which a type that was not found is searched for again: a package may be installed.
-const SEARCH_AGAIN: Duration = Duration::from_secs(60);
+const SEARCH_INTERVAL: Duration = Duration::from_secs(60);
 /// Number of failures that are reported in the log.
 const MAX_REPORTED: usize = 64;
 
@@ -70,7 +70,8 @@ struct Found {
 impl Found {
     /// Returns whether a further search would have the same result, at this revision.
     fn is_valid(&self, revision: u64) -> bool {
-        self.message_type.is_ok() || (self.revision == revision && self.at.elapsed() < SEARCH_AGAIN)
+        self.message_type.is_ok()
+            || (self.revision == revision && self.at.elapsed() < SEARCH_INTERVAL)
     }
 }
 
@@ -163,7 +164,7 @@ impl FieldMetrics {
     /// Creates the metrics of the standard types and of these fields.
     #[must_use]
     pub fn new(extractions: &[Extraction], library: Arc<Library>) -> Self {
-        let standard = STANDARD.iter().filter_map(|(name, field, metric)| {
+        let standard = STANDARD_FIELDS.iter().filter_map(|(name, field, metric)| {
             Some(Field {
                 of: Scope::Type(name),
                 text: (*field).to_owned(),
@@ -289,7 +290,7 @@ impl FieldMetrics {
 /// Decodes a message, if its type was found.
 fn decoded<'a>(message: &'a FieldMessage, found: &'a Found) -> Result<Decoded<'a>, NoValue> {
     let limits = Limits {
-        kept: ELEMENTS,
+        kept: MAX_ELEMENTS,
         ..Limits::default()
     };
     let message_type = found.message_type.as_ref().map_err(Clone::clone)?;

@@ -36,7 +36,7 @@ use crate::limit_facts::LimitFigures;
 use crate::snapshot_cell::SnapshotCell;
 use ros2probe_metrics::exposition::{Exposition, Format};
 
-const INDEX: &str = "<!doctype html><title>ros2probe</title><h1>ros2probe</h1>
+const INDEX_PAGE: &str = "<!doctype html><title>ros2probe</title><h1>ros2probe</h1>
 <p>Watches the ROS 2 robot on this host from copies of its traffic.
 <ul><li><a href=\"/metrics\">/metrics</a> for Prometheus
 <li><a href=\"/readyz\">/readyz</a> whether the agent observes the robot: 200, or 503 with the reason
@@ -177,7 +177,7 @@ fn router(sources: MetricSources) -> Router {
     let (latest, limits) = (Arc::clone(&sources.latest), Arc::clone(&sources.limits));
     let exposition = Arc::new(Exposition::new(sources));
     Router::new()
-        .route("/", get(async || Html(INDEX)))
+        .route("/", get(async || Html(INDEX_PAGE)))
         .route("/metrics", get(metrics))
         .route("/healthz", get(async || "ok\n"))
         .route("/readyz", get(readyz))
@@ -196,7 +196,7 @@ fn router(sources: MetricSources) -> Router {
 }
 
 /// Pages that are being created and read.
-static PAGES: LargeResponses = LargeResponses::new();
+static METRICS_RESPONSES: LargeResponses = LargeResponses::new();
 
 /// Maximum time that a scrape waits for a fresh snapshot. The capture thread usually responds
 /// immediately.
@@ -211,7 +211,7 @@ async fn metrics(Extract(pages): Extract<Pages>, headers: HeaderMap) -> Response
     let format = Format::negotiate(&accepts.join(","));
     let encoding = encoding(&headers);
     pages.latest.refresh(REFRESH_TIMEOUT).await;
-    let Some(turn) = PAGES.turn().await else {
+    let Some(turn) = METRICS_RESPONSES.permit().await else {
         pages.limits.reached(Limit::MetricsClients, 1);
         let reason = "too many pages are being rendered
 ";
@@ -234,7 +234,7 @@ async fn metrics(Extract(pages): Extract<Pages>, headers: HeaderMap) -> Response
             (VARY, "accept, accept-encoding"),
         ],
         [(CONTENT_LENGTH, page.len())],
-        turn.keep_packed(page),
+        turn.compressed_body(page),
     )
         .into_response();
     if encoding == Encoding::Gzip {

@@ -13,18 +13,18 @@ use tokio_util::sync::CancellationToken;
 use super::compressed_text::{CompressedText, Encoding, TextCompressor};
 
 /// Maximum number of large answers of one surface that are created simultaneously.
-const AT_ONCE: usize = 2;
+const MAX_CONCURRENT: usize = 2;
 /// Budget in bytes for compressed answers of one surface that are being read.
-const KEPT: usize = 4 << 20;
+const MAX_RETAINED_BYTES: usize = 4 << 20;
 /// Minimum size of a large answer, in bytes.
-const LARGE: usize = 256 << 10;
+const MIN_LARGE_BYTES: usize = 256 << 10;
 /// Maximum time that a request waits for a permit.
-const TIMEOUT: Duration = Duration::from_secs(2);
+const PERMIT_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Large answers of one surface.
 #[derive(Debug)]
 pub(super) struct LargeResponses {
-    making: Semaphore,
+    permits: Semaphore,
     longest: Duration,
     kept: Mutex<Vec<Pending>>,
 }
@@ -34,7 +34,7 @@ pub(super) struct LargeResponses {
 struct Pending {
     bytes: usize,
     /// Revokes the answer: its reader receives no further data.
-    given_up: CancellationToken,
+    revoked: CancellationToken,
 }
 
 /// Permission to create one answer.
@@ -55,15 +55,15 @@ impl LargeResponses {
     /// Creates the state without any answers.
     pub(super) const fn new() -> Self {
         Self {
-            making: Semaphore::const_new(AT_ONCE),
-            longest: TIMEOUT,
+            permits: Semaphore::const_new(MAX_CONCURRENT),
+            longest: PERMIT_TIMEOUT,
             kept: Mutex::new(Vec::new()),
         }
     }
 
     /// Returns a permit, or `None` after a timeout.
-    pub(super) async fn turn(&'static self) -> Option<RenderPermit> {
-        let making = timeout(self.longest, self.making.acquire()).await;
+    pub(super) async fn permit(&'static self) -> Option<RenderPermit> {
+        let making = timeout(self.longest, self.permits.acquire()).await;
         let making = making.ok()?.ok()?;
         Some(RenderPermit {
             of: self,
@@ -72,21 +72,21 @@ impl LargeResponses {
     }
 
     /// Reserves memory for an answer of this size, revoking the oldest answers if necessary.
-    fn room(&'static self, bytes: usize) -> Reservation {
+    fn reserve(&'static self, bytes: usize) -> Reservation {
         let given_up = CancellationToken::new();
         let mut kept = self.lock();
         let mut sum: usize = kept.iter().map(|each| each.bytes).sum();
         kept.retain(|each| {
-            let stays = sum + bytes <= KEPT;
+            let stays = sum + bytes <= MAX_RETAINED_BYTES;
             if !stays {
-                each.given_up.cancel();
+                each.revoked.cancel();
                 sum -= each.bytes;
             }
             stays
         });
         kept.push(Pending {
             bytes,
-            given_up: given_up.clone(),
+            revoked: given_up.clone(),
         });
         Reservation { of: self, given_up }
     }
@@ -98,23 +98,23 @@ impl LargeResponses {
 
 impl RenderPermit {
     /// Returns the text as a response body.
-    pub(super) fn keep_packed(self, text: CompressedText) -> Body {
-        if text.len() < LARGE {
+    pub(super) fn compressed_body(self, text: CompressedText) -> Body {
+        if text.len() < MIN_LARGE_BYTES {
             return text.into_body(None);
         }
-        let room = self.of.room(text.kept());
+        let room = self.of.reserve(text.kept());
         text.into_body(Some(room))
     }
 
     /// Returns the bytes as a response body of the same length.
-    pub(super) fn keep(self, bytes: Bytes) -> Body {
-        if bytes.len() < LARGE {
+    pub(super) fn body(self, bytes: Bytes) -> Body {
+        if bytes.len() < MIN_LARGE_BYTES {
             return bytes.into();
         }
         let mut packer = TextCompressor::new(Encoding::Identity);
         let packed = packer.write(&bytes).and_then(|()| packer.finish());
         match packed {
-            Ok(packed) => self.keep_packed(packed),
+            Ok(packed) => self.compressed_body(packed),
             // Writing to memory cannot fail.
             Err(_) => Body::empty(),
         }
@@ -123,7 +123,7 @@ impl RenderPermit {
 
 impl Reservation {
     /// Returns whether the memory is revoked.
-    pub(super) fn is_given_up(&self) -> bool {
+    pub(super) fn is_revoked(&self) -> bool {
         self.given_up.is_cancelled()
     }
 }
@@ -131,7 +131,7 @@ impl Reservation {
 impl Drop for Reservation {
     fn drop(&mut self) {
         self.given_up.cancel();
-        self.of.lock().retain(|each| !each.given_up.is_cancelled());
+        self.of.lock().retain(|each| !each.revoked.is_cancelled());
     }
 }
 
@@ -156,18 +156,18 @@ mod tests {
     #[tokio::test]
     async fn slow_readers_of_large_answers_do_not_block_others() {
         static ANSWERS: LargeResponses = LargeResponses {
-            making: Semaphore::const_new(AT_ONCE),
+            permits: Semaphore::const_new(MAX_CONCURRENT),
             longest: Duration::ZERO,
             kept: Mutex::new(Vec::new()),
         };
         let bytes = noise(1 << 20);
         let mut bodies = Vec::new();
         for _ in 0..12 {
-            let turn = ANSWERS.turn().await.unwrap();
-            bodies.push(turn.keep(bytes.clone()));
+            let turn = ANSWERS.permit().await.unwrap();
+            bodies.push(turn.body(bytes.clone()));
         }
         let held: usize = ANSWERS.lock().iter().map(|kept| kept.bytes).sum();
-        assert!(held <= KEPT, "{held}");
+        assert!(held <= MAX_RETAINED_BYTES, "{held}");
         // The last answers are complete, and the first answers end early.
         let mut whole = 0;
         for body in bodies {
@@ -186,15 +186,15 @@ mod tests {
     #[tokio::test]
     async fn a_third_answer_gets_no_permit_until_one_of_two_is_created() {
         static ANSWERS: LargeResponses = LargeResponses {
-            making: Semaphore::const_new(AT_ONCE),
+            permits: Semaphore::const_new(MAX_CONCURRENT),
             longest: Duration::ZERO,
             kept: Mutex::new(Vec::new()),
         };
-        let one = ANSWERS.turn().await.unwrap();
-        let _two = ANSWERS.turn().await.unwrap();
-        assert!(ANSWERS.turn().await.is_none());
-        let _small = one.keep(noise(LARGE - 1));
-        assert!(ANSWERS.turn().await.is_some());
+        let one = ANSWERS.permit().await.unwrap();
+        let _two = ANSWERS.permit().await.unwrap();
+        assert!(ANSWERS.permit().await.is_none());
+        let _small = one.body(noise(MIN_LARGE_BYTES - 1));
+        assert!(ANSWERS.permit().await.is_some());
         assert!(ANSWERS.lock().is_empty(), "small answers take no room");
     }
 }

@@ -19,15 +19,15 @@ use crate::limit_facts::{LimitFigures, Slot, Slots};
 /// Maximum time for a refused client to read the answer, and maximum number of such clients at a
 /// time.
 const REFUSAL_TIMEOUT: Duration = Duration::from_secs(1);
-const FAREWELLS: usize = 64;
+const MAX_REFUSALS: usize = 64;
 /// Maximum number of bytes read of a refused request, so that its sender receives the answer.
-const REQUEST: u64 = 64 << 10;
+const MAX_REFUSED_REQUEST: u64 = 64 << 10;
 /// Maximum time until a connection is found that waits for its client, if some were not read yet.
 const SEARCH_TIMEOUT: Duration = Duration::from_millis(100);
 /// Maximum time that an evicted connection may take to close.
 const EVICTION_TIMEOUT: Duration = Duration::from_millis(100);
 /// Time between two searches for a connection that waits for its client.
-const PAUSE: Duration = Duration::from_millis(2);
+const SEARCH_INTERVAL: Duration = Duration::from_millis(2);
 
 /// A listener with a limited number of connections.
 #[derive(Debug)]
@@ -38,7 +38,7 @@ pub(super) struct LimitedListener<L> {
     limits: Arc<LimitFigures>,
     limit: Limit,
     refusal: Option<Refusal>,
-    leaving: JoinSet<()>,
+    refusals: JoinSet<()>,
 }
 
 /// The answer to connections beyond the limit.
@@ -61,7 +61,7 @@ impl<L> LimitedListener<L> {
             limits,
             limit,
             refusal,
-            leaving: JoinSet::new(),
+            refusals: JoinSet::new(),
         }
     }
 
@@ -77,7 +77,7 @@ impl<L> LimitedListener<L> {
                 match self.connections.make_room() {
                     true => return true,
                     false if !self.connections.has_unread() => return false,
-                    false => sleep(PAUSE).await,
+                    false => sleep(SEARCH_INTERVAL).await,
                 }
             }
         };
@@ -86,7 +86,7 @@ impl<L> LimitedListener<L> {
                 if let Some(slot) = self.slots.take() {
                     return slot;
                 }
-                self.connections.left().await;
+                self.connections.wait_closed().await;
             }
         };
         match timeout(SEARCH_TIMEOUT, evicted).await {
@@ -99,11 +99,11 @@ impl<L> LimitedListener<L> {
     /// Refuses a connection without a slot, in the background. The number of such answers in
     /// progress is limited.
     fn reject(&mut self, stream: impl AsyncRead + AsyncWrite + Unpin + Send + 'static) {
-        while self.leaving.try_join_next().is_some() {}
+        while self.refusals.try_join_next().is_some() {}
         if let Some(refusal) = self.refusal.clone()
-            && self.leaving.len() < FAREWELLS
+            && self.refusals.len() < MAX_REFUSALS
         {
-            self.leaving.spawn(async move {
+            self.refusals.spawn(async move {
                 let _ = timeout(REFUSAL_TIMEOUT, refusal.send(stream)).await;
             });
         }
@@ -140,7 +140,11 @@ impl Refusal {
         stream.write_all(self.0.as_bytes()).await?;
         stream.shutdown().await?;
         // Closing with unread data would reset the connection and might lose the answer.
-        tokio::io::copy(&mut stream.take(REQUEST), &mut tokio::io::sink()).await?;
+        tokio::io::copy(
+            &mut stream.take(MAX_REFUSED_REQUEST),
+            &mut tokio::io::sink(),
+        )
+        .await?;
         Ok(())
     }
 }

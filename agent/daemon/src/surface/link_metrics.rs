@@ -10,7 +10,7 @@ use ros2probe_model::report::snapshot::Snapshot;
 /// Reads a figure of a link.
 type Figure = fn(&LinkFacts) -> u64;
 
-const FIGURES: [(&Metric, Figure); 4] = [
+const LINK_FIGURES: [(&Metric, Figure); 4] = [
     (&metric::LINK_CONNECTIONS, |link| link.connections),
     (&metric::LINK_SENT, |link| link.sent),
     (&metric::LINK_RETRANSMITTED, |link| link.retransmitted),
@@ -34,7 +34,7 @@ pub(super) fn links(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::Resu
             Label::Text(destination),
         ]
     };
-    for (metric, figure) in FIGURES {
+    for (metric, figure) in LINK_FIGURES {
         sink.family(metric, |family| {
             links.iter().try_for_each(|(facts, source, destination)| {
                 let labels = labels(facts.key.protocol.label(), source, destination);

@@ -61,7 +61,7 @@ impl Usage {
 /// Maximum length of a command line that is read, in bytes.
 const COMMAND_LINE: u64 = 4096;
 /// Beginnings of the names of interpreters.
-const INTERPRETERS: [&str; 6] = ["python", "node", "ruby", "perl", "bash", "sh"];
+const INTERPRETER_PREFIXES: [&str; 6] = ["python", "node", "ruby", "perl", "bash", "sh"];
 
 /// Returns the file or module that an interpreter runs; `None` for another program.
 pub(super) fn script(id: u32) -> Option<String> {
@@ -77,7 +77,7 @@ fn script_of(line: &[u8]) -> Option<String> {
     let mut words = words.filter(|word| !word.is_empty());
     let file_name = |path: &str| path.rsplit('/').next().unwrap_or_default().to_owned();
     let program = file_name(&words.next()?);
-    let is_interpreter = INTERPRETERS.iter().any(|name| {
+    let is_interpreter = INTERPRETER_PREFIXES.iter().any(|name| {
         let version = program.strip_prefix(name);
         version.is_some_and(|version| {
             version

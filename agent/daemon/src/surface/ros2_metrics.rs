@@ -463,7 +463,7 @@ pub(super) fn writers(
         sink.family(metric, |family| {
             rows.iter()
                 .filter(|_| settings.per_writer)
-                .try_for_each(|row| each_writer(family, row, value))
+                .try_for_each(|row| for_each_writer(family, row, value))
         })?;
     }
     Ok(())
@@ -518,8 +518,8 @@ fn topic_info(family: &mut Family<'_>, row: &TopicRow<'_>) -> fmt::Result {
         &facts.publishers
     };
     let policies =
-        |policy: fn(&EndpointFacts) -> &'static str| joined(endpoints.iter().map(policy));
-    let message_types = joined(facts.message_types.iter().map(TypeName::as_str));
+        |policy: fn(&EndpointFacts) -> &'static str| join_values(endpoints.iter().map(policy));
+    let message_types = join_values(facts.message_types.iter().map(TypeName::as_str));
     let reliability = policies(|endpoint| endpoint.qos.reliability.label());
     let durability = policies(|endpoint| endpoint.qos.durability.label());
     family.info(&[
@@ -533,7 +533,7 @@ fn topic_info(family: &mut Family<'_>, row: &TopicRow<'_>) -> fmt::Result {
 }
 
 /// Joins the different values, sorted, up to [`MAX_JOINED`].
-fn joined<'a>(values: impl Iterator<Item = &'a str>) -> String {
+fn join_values<'a>(values: impl Iterator<Item = &'a str>) -> String {
     let different: BTreeSet<&str> = values.collect();
     let mut text = String::new();
     for value in different.iter().take(MAX_JOINED) {
@@ -548,7 +548,7 @@ fn joined<'a>(values: impl Iterator<Item = &'a str>) -> String {
     text
 }
 
-fn each_writer(family: &mut Family<'_>, row: &TopicRow<'_>, value: Count) -> fmt::Result {
+fn for_each_writer(family: &mut Family<'_>, row: &TopicRow<'_>, value: Count) -> fmt::Result {
     let mut seen = BTreeSet::new();
     for writer in row.facts.iter().flat_map(|facts| &facts.publishers) {
         let Some(measured) = &writer.measurement else {

@@ -29,7 +29,7 @@ pub(super) const MAX_HEAD: usize = 48 << 10;
 const MAX_FIELDS: usize = 64;
 
 /// Turns the connections of a listener into HTTP streams.
-pub(super) trait Wrap<S>: Send + 'static {
+pub(super) trait WrapStream<S>: Send + 'static {
     /// The HTTP stream.
     type Io: AsyncRead + AsyncWrite + Unpin + Send + 'static;
 
@@ -40,7 +40,7 @@ pub(super) trait Wrap<S>: Send + 'static {
 /// Plain connections, without TLS.
 pub(super) struct Plain;
 
-impl<S: AsyncRead + AsyncWrite + Unpin + Send + 'static> Wrap<S> for Plain {
+impl<S: AsyncRead + AsyncWrite + Unpin + Send + 'static> WrapStream<S> for Plain {
     type Io = Connection<S>;
 
     fn wrap(&self, connection: Connection<S>) -> Connection<S> {
@@ -59,7 +59,7 @@ pub(super) async fn serve<L, W, M>(
 ) where
     L: Listener,
     L::Io: Unpin,
-    W: Wrap<L::Io>,
+    W: WrapStream<L::Io>,
     M: Clone + Send + Sync + 'static,
 {
     let mut connections = JoinSet::new();
@@ -99,7 +99,7 @@ async fn answer<M: Clone + Send + Sync + 'static>(
         async move {
             let answer = answer.await?;
             let length = answer.body().size_hint().exact();
-            state.answers(length.is_some() || answer.headers().contains_key(CONTENT_LENGTH));
+            state.begin_answer(length.is_some() || answer.headers().contains_key(CONTENT_LENGTH));
             Ok::<_, Infallible>(answer.map(|body| Answered { body, state }))
         }
     });

@@ -22,7 +22,7 @@ use tokio_rustls::server::TlsStream;
 use tokio_rustls::{Accept, TlsAcceptor};
 
 use super::connection::Connection;
-use super::serving::Wrap;
+use super::serving::WrapStream;
 use super::web_config::TlsFiles;
 
 /// Maximum size of a file with certificates or a key, in bytes.
@@ -49,7 +49,7 @@ pub enum TlsError {
     },
     /// Certificates and key cannot be used, for example because they do not match.
     #[error("certificate and key (`tls_server_config`) cannot be used")]
-    Unfit(#[from] rustls::Error),
+    Unusable(#[from] rustls::Error),
     /// The client authorities are invalid.
     #[error("client_ca_file (`tls_server_config`) cannot be used")]
     Authorities(#[from] VerifierBuilderError),
@@ -127,7 +127,7 @@ fn read(path: &Path) -> Result<Vec<u8>, TlsError> {
         })
 }
 
-impl<S: AsyncRead + AsyncWrite + Unpin + Send + 'static> Wrap<S> for Acceptor {
+impl<S: AsyncRead + AsyncWrite + Unpin + Send + 'static> WrapStream<S> for Acceptor {
     type Io = Stream<Connection<S>>;
 
     fn wrap(&self, connection: Connection<S>) -> Self::Io {

@@ -13,7 +13,7 @@ use serde::Deserialize;
 /// Maximum size of the file, in bytes.
 const MAX_BYTES: u64 = 1 << 20;
 /// Accepted bcrypt costs. Each step doubles the time of a check; 16 takes seconds on a robot.
-const COSTS: std::ops::RangeInclusive<u8> = 4..=16;
+const BCRYPT_COSTS: std::ops::RangeInclusive<u8> = 4..=16;
 
 /// The validated content of the file.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -99,7 +99,7 @@ pub enum InvalidHash {
     #[error("is not a bcrypt hash, as printed by `htpasswd -nBC 10 NAME`")]
     NotBcrypt,
     /// The cost is outside of the accepted range.
-    #[error("has cost {cost}, must be {} to {}", COSTS.start(), COSTS.end())]
+    #[error("has cost {cost}, must be {} to {}", BCRYPT_COSTS.start(), BCRYPT_COSTS.end())]
     Cost {
         /// The cost.
         cost: u8,
@@ -203,7 +203,7 @@ fn check_hash(hash: &str) -> Result<(), InvalidHash> {
     let cost: u8 = cost
         .and_then(|cost| cost.parse().ok())
         .ok_or(InvalidHash::NotBcrypt)?;
-    if !COSTS.contains(&cost) {
+    if !BCRYPT_COSTS.contains(&cost) {
         return Err(InvalidHash::Cost { cost });
     }
     Ok(())

@@ -13,7 +13,7 @@ type Figure = fn(&ZenohFacts) -> u64;
 
 /// Writes the metrics of Zenoh.
 pub(super) fn zenoh(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::Result {
-    const FIGURES: [(&Metric, Figure); 6] = [
+    const ZENOH_FIGURES: [(&Metric, Figure); 6] = [
         (&metric::ZENOH_CONNECTIONS, |zenoh| zenoh.connections),
         (&metric::ZENOH_ROUTERS, |zenoh| zenoh.routers),
         (&metric::ZENOH_BATCHES, |zenoh| zenoh.counters.batches),
@@ -22,7 +22,7 @@ pub(super) fn zenoh(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::Resu
         (&metric::ZENOH_INCOMPLETE, |zenoh| zenoh.counters.incomplete),
     ];
     let known = snapshot.zenoh.as_ref();
-    for (metric, figure) in FIGURES {
+    for (metric, figure) in ZENOH_FIGURES {
         sink.family(metric, |family| {
             known.map_or(Ok(()), |zenoh| family.sample(&[], figure(zenoh)))
         })?;

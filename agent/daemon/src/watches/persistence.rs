@@ -19,20 +19,20 @@ use crate::config::watch::{
     check_pattern, check_trace,
 };
 use crate::config::{Limit, check_globs};
-use crate::state::{ENDING, Form, Found, Newer, StateDirectory, from_json, join_until};
+use crate::state::{END_TIMEOUT, Form, Found, Newer, StateDirectory, from_json, join_until};
 
-const FILE: &str = "watches.json";
+const WATCHES_FILE: &str = "watches.json";
 /// Version of the written format. Fields added so far may be missing in a file. Further fields need
 /// a new version, since older agents would consider the file broken.
 const VERSION: u32 = 1;
-const FORM: Form<Document> = Form {
-    file: FILE,
+const WATCHES_FORM: Form<Document> = Form {
+    file: WATCHES_FILE,
     readers: &[(VERSION, from_json)],
 };
 /// Delay of a write, so that changes within this time are written together.
 const WRITE_DELAY: Duration = Duration::from_millis(50);
 /// Time after a failure until the next attempt.
-const AGAIN: Duration = Duration::from_secs(5);
+const RETRY_DELAY: Duration = Duration::from_secs(5);
 
 /// Saved watches at the start.
 #[derive(Debug, PartialEq)]
@@ -107,7 +107,7 @@ struct Pending {
 /// Reads the watches that clients of the previous agent added. An invalid file is moved aside.
 #[must_use]
 pub fn load(directory: &StateDirectory) -> LoadedWatches {
-    let document = match directory.read(&FORM) {
+    let document = match directory.read(&WATCHES_FORM) {
         Found::Nothing => return LoadedWatches::Nothing,
         Found::Newer(newer) => return LoadedWatches::Newer(newer),
         Found::Unusable { reason, moved_to } => {
@@ -128,7 +128,7 @@ pub fn load(directory: &StateDirectory) -> LoadedWatches {
     });
     match watches {
         Ok(watches) => LoadedWatches::These(watches),
-        Err(error) => match directory.set_aside::<Document>(FILE, error.to_string()) {
+        Err(error) => match directory.move_aside::<Document>(WATCHES_FILE, error.to_string()) {
             Found::Unusable { reason, moved_to } => LoadedWatches::Unusable { reason, moved_to },
             Found::Nothing | Found::This(_) | Found::Newer(_) => LoadedWatches::Nothing,
         },
@@ -228,23 +228,24 @@ impl WatchWriter {
     }
 
     /// Passes the list to the writing thread, without blocking.
-    pub(super) fn keep(&self, watches: Vec<Arc<Watch>>) {
+    pub(super) fn store(&self, watches: Vec<Arc<Watch>>) {
         self.mailbox.pending().latest = Some(watches);
         self.mailbox.changed.notify_one();
     }
 
     /// Returns whether the last write succeeded, and the current one takes no longer than usual.
-    pub(super) fn works(&self) -> bool {
+    pub(super) fn is_working(&self) -> bool {
         !self.mailbox.pending().is_failing && self.mailbox.progress.stalled().is_none()
     }
 
-    /// Waits until the latest list is written, or its write has failed, for at most [`ENDING`].
+    /// Waits until the latest list is written, or its write has failed, for at most
+    /// [`END_TIMEOUT`].
     pub(super) fn finish(&self) {
         self.mailbox.pending().is_closed = true;
         self.mailbox.changed.notify_one();
         let mut thread = self.thread.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(thread) = thread.take()
-            && !join_until(thread, Instant::now() + ENDING)
+            && !join_until(thread, Instant::now() + END_TIMEOUT)
         {
             tracing::error!("the file system does not answer: the added watches are not saved");
         }
@@ -263,8 +264,8 @@ impl Mailbox {
                 watches: watches.iter().map(|watch| Line::from(&**watch)).collect(),
             };
             self.progress.step();
-            let written = directory.replace(FILE, &document);
-            self.progress.rest();
+            let written = directory.replace(WATCHES_FILE, &document);
+            self.progress.set_idle();
             let mut pending = self.pending();
             let failed_before = mem::replace(&mut pending.is_failing, written.is_err());
             // At the end, a failed write is not retried.
@@ -289,7 +290,7 @@ impl Mailbox {
     fn next(&self) -> Option<Vec<Arc<Watch>>> {
         let mut pending = self.pending();
         if pending.is_failing && !pending.is_closed {
-            let again = self.changed.wait_timeout(pending, AGAIN);
+            let again = self.changed.wait_timeout(pending, RETRY_DELAY);
             pending = again.unwrap_or_else(PoisonError::into_inner).0;
         }
         let idle = |pending: &mut Pending| pending.latest.is_none() && !pending.is_closed;
@@ -341,8 +342,8 @@ mod tests {
         let (_place, directory) = directory();
         assert_eq!(load(&directory), LoadedWatches::Nothing);
         let keeper = WatchWriter::start(Arc::clone(&directory)).unwrap();
-        keeper.keep(Vec::new());
-        keeper.keep(shared());
+        keeper.store(Vec::new());
+        keeper.store(shared());
         keeper.finish();
         assert_eq!(load(&directory), LoadedWatches::These(watches()));
     }
@@ -350,12 +351,12 @@ mod tests {
     #[test]
     fn an_invalid_list_of_watches_is_moved_aside() {
         let (place, directory) = directory();
-        let file = place.path().join(FILE);
+        let file = place.path().join(WATCHES_FILE);
         let document = Document {
             version: VERSION,
             watches: watches().iter().map(Line::from).collect(),
         };
-        directory.replace(FILE, &document).unwrap();
+        directory.replace(WATCHES_FILE, &document).unwrap();
         let whole = fs::read_to_string(&file).unwrap();
         let broken = [
             whole[..whole.len() / 2].to_owned(),
@@ -389,7 +390,7 @@ mod tests {
             version: VERSION,
             watches: globs.map(|watch| Line::from(&watch)).collect(),
         };
-        directory.replace(FILE, &document).unwrap();
+        directory.replace(WATCHES_FILE, &document).unwrap();
         let LoadedWatches::Unusable { reason, moved_to } = load(&directory) else {
             panic!("it was read");
         };
@@ -401,7 +402,7 @@ mod tests {
     #[test]
     fn a_list_of_a_newer_agent_is_kept_and_one_in_the_first_format_is_read() {
         let (place, directory) = directory();
-        let file = place.path().join(FILE);
+        let file = place.path().join(WATCHES_FILE);
         let newer = r#"{"version":2,"watches":[{"topic":"/points","colour":"red"}]}"#;
         fs::write(&file, newer).unwrap();
         let found = Newer {
@@ -435,9 +436,9 @@ mod tests {
         let obstacle = place.path().join("watches.json.new");
         fs::create_dir(&obstacle).unwrap();
         let keeper = WatchWriter::start(Arc::clone(&directory)).unwrap();
-        keeper.keep(shared());
+        keeper.store(shared());
         let start = Instant::now();
-        while keeper.works() {
+        while keeper.is_working() {
             assert!(start.elapsed() < Duration::from_secs(10));
             std::thread::yield_now();
         }

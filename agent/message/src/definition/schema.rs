@@ -12,9 +12,9 @@ use crate::definition::{
 };
 
 /// The line between definitions.
-const LINE: &str =
+const SEPARATOR_LINE: &str =
     "================================================================================";
-const ENCODING: &str = "ros2msg";
+const SCHEMA_ENCODING: &str = "ros2msg";
 
 impl MessageType {
     /// Returns encoding and text for a bag's schema: the files as they were read. A service's event
@@ -33,7 +33,7 @@ impl MessageType {
         } else if let Some(structure) = self.structure(&self.root) {
             self.append_structure(&mut text, structure, &mut written);
         }
-        (ENCODING, text)
+        (SCHEMA_ENCODING, text)
     }
 
     fn service_of_event(&self) -> Option<&Definition> {
@@ -102,7 +102,7 @@ fn short(name: &TypeName) -> String {
 }
 
 fn heading(text: &mut String, kind: &str, name: &str) {
-    let _ = writeln!(text, "{LINE}\n{kind}: {name}");
+    let _ = writeln!(text, "{SEPARATOR_LINE}\n{kind}: {name}");
 }
 
 /// Returns the lines of a `.msg` file with these fields.
@@ -151,7 +151,7 @@ pub(crate) fn parts<'a>(
     while let Some((index, line)) = lines.next() {
         let line_start = offset;
         offset += line.len();
-        if line.trim_end() != LINE {
+        if line.trim_end() != SEPARATOR_LINE {
             continue;
         }
         let (_, below) = lines.next().unwrap_or((index, ""));
@@ -220,18 +220,18 @@ uint32 nanosec
         // The text between two definitions ends with an empty line that belongs to the separator.
         let tight = STAMPED.replace("\n\n====", "\n====");
         let again = MessageType::parse(&root, &tight).unwrap();
-        assert_eq!(again.schema_text(), (ENCODING, STAMPED.to_owned()));
+        assert_eq!(again.schema_text(), (SCHEMA_ENCODING, STAMPED.to_owned()));
         assert_eq!(parsed.type_hash(), again.type_hash());
         assert_eq!(parsed.structures().count(), 4);
     }
 
     #[test]
     fn headings_with_and_without_msg_are_read_and_others_are_refused() {
-        let text = format!("B b\n{LINE}\nMSG: a/msg/B\nint8 x\n");
+        let text = format!("B b\n{SEPARATOR_LINE}\nMSG: a/msg/B\nint8 x\n");
         let read = MessageType::parse(&"a/msg/A".parse().unwrap(), &text).unwrap();
         assert_eq!(read.structures().count(), 2);
         for heading in ["IDL: a/msg/B", "MSG: B", "MSG: a/../B", ""] {
-            let text = format!("B b\n{LINE}\n{heading}\nint8 x\n");
+            let text = format!("B b\n{SEPARATOR_LINE}\n{heading}\nint8 x\n");
             let error = MessageType::parse(&"a/msg/A".parse().unwrap(), &text).unwrap_err();
             assert_eq!(error, SchemaError::Heading { line: 3 }, "{heading}");
         }
@@ -284,7 +284,7 @@ uint32 nanosec
                 ..Sources::default()
             });
             let found = library.find(&name, None).unwrap();
-            assert_eq!(found.schema_text(), (ENCODING, expected), "{name}");
+            assert_eq!(found.schema_text(), (SCHEMA_ENCODING, expected), "{name}");
         }
     }
 
@@ -296,7 +296,7 @@ uint32 nanosec
             prop_assert_eq!(&*read.structures[0], &structure);
             // The same structure is read as a nested type.
             let root = "a/msg/Root".parse().unwrap();
-            let text = format!("B b\n{}{LINE}\nMSG: a/B\n{}", members(&more), members(&structure));
+            let text = format!("B b\n{}{SEPARATOR_LINE}\nMSG: a/B\n{}", members(&more), members(&structure));
             if let Ok(read) = MessageType::parse(&root, &text) {
                 let again = MessageType::parse(&root, &read.schema_text().1).unwrap();
                 prop_assert_eq!(again.type_hash(), read.type_hash());
@@ -338,7 +338,7 @@ uint32 nanosec
         "#",
         "---",
         "@key",
-        LINE,
+        SEPARATOR_LINE,
         "MSG: a/C",
         "module a { module msg {",
         "struct B {",

@@ -534,10 +534,10 @@ fn call<'a>(function: Function, arguments: &[Object<'a>]) -> Result<Object<'a>, 
 }
 
 fn integer<'a>(object: &Object<'a>) -> Result<Object<'a>, Exception> {
-    const LARGEST: f64 = 1e38;
+    const MAX_MAGNITUDE: f64 = 1e38;
     Ok(Object::Int(match (object, object.number()) {
         (_, Some(Number::Int(number))) => number,
-        (_, Some(Number::Float(number))) if number.abs() < LARGEST => {
+        (_, Some(Number::Float(number))) if number.abs() < MAX_MAGNITUDE => {
             #[expect(clippy::cast_possible_truncation, reason = "int() drops the fraction")]
             let whole = number.trunc() as i128;
             whole

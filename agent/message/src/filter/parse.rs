@@ -332,7 +332,7 @@ impl<'a> Parser<'a> {
             "None" => Kind::None,
             _ => {
                 let Some(function) = Function::named(name) else {
-                    let known = Function::NAMES.map(|(name, _)| name).join(", ");
+                    let known = Function::FUNCTION_NAMES.map(|(name, _)| name).join(", ");
                     let message =
                         format!("`{name}` is unknown; known are `m` (the message) and {known}");
                     return Err(FilterError::new(column, message));

@@ -13,7 +13,7 @@ use crate::embedded;
 use crate::library::NotFound;
 
 /// Extension of the file that defines a type without a `.msg`, `.srv` or `.action` file.
-const IDL: &str = "idl";
+const IDL_EXTENSION: &str = "idl";
 
 /// A source.
 #[derive(Debug)]
@@ -53,7 +53,7 @@ impl DefinitionSource {
         };
         directories.iter().find_map(|directory| {
             let directory = directory.join(name.package()).join(kind);
-            [kind, IDL].into_iter().find_map(|extension| {
+            [kind, IDL_EXTENSION].into_iter().find_map(|extension| {
                 let path = directory.join(format!("{}.{extension}", name.name()));
                 match std::fs::metadata(&path) {
                     Err(error) if is_absent(&error) => None,
@@ -79,7 +79,10 @@ impl DefinitionSource {
                 (path, text)
             }
         };
-        let definition = if path.extension().is_some_and(|extension| extension == IDL) {
+        let definition = if path
+            .extension()
+            .is_some_and(|extension| extension == IDL_EXTENSION)
+        {
             Definition::parse_idl(name.clone(), &text)
         } else {
             Definition::parse(name.clone(), &text)

@@ -11,7 +11,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use ros2probe_wire::discovery::EquivalenceHash;
 
 use crate::definition::{MessageType, TypeName};
-use crate::library::HASH;
+use crate::library::HASH_PREFIX;
 use crate::library::kept::Kept;
 use crate::library::objects::Objects;
 use crate::type_description::{MAX_RESPONSE, described_type};
@@ -24,7 +24,7 @@ pub(super) const MAX_WAITING_BYTES: usize = 2 << 20;
 pub(super) const MAX_TYPES: usize = 512;
 pub(super) const MAX_BYTES: usize = 8 << 20;
 /// Approximate memory of a structure or field, in addition to its text.
-const OVERHEAD: usize = 160;
+const ENTRY_OVERHEAD: usize = 160;
 
 /// Described types and their counters. Lookups read responses without a lock that
 /// [`Self::offer`] or [`Self::figures`] takes, so the thread that captures never waits for them.
@@ -150,8 +150,8 @@ impl Described {
         }
     }
 
-    /// Returns the type with the announced hash, RIHS01 or that of XTypes. Returns the latest one if
-    /// no hash is announced.
+    /// Returns the type with the announced hash, RIHS01 or that of XTypes. Returns the latest one
+    /// if no hash is announced.
     pub(super) fn find(
         &self,
         name: &TypeName,
@@ -268,7 +268,8 @@ impl Types {
             let found = latest.map(|(_, entry)| Arc::clone(&entry.value));
             return found.ok_or(None);
         };
-        let is_same_kind = |hash: &str| hash.starts_with(HASH) == announced.starts_with(HASH);
+        let is_same_kind =
+            |hash: &str| hash.starts_with(HASH_PREFIX) == announced.starts_with(HASH_PREFIX);
         let other = of_name.find(|((_, hash), _)| is_same_kind(hash));
         let other = other.map(|((_, hash), _)| hash.clone());
         if let Some(entry) = self
@@ -293,7 +294,7 @@ fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 fn size(message_type: &MessageType) -> usize {
     let structures = message_type.structures().map(|structure| {
         let names = structure.fields.iter().map(|field| field.name.len());
-        OVERHEAD * (1 + structure.fields.len()) + names.sum::<usize>()
+        ENTRY_OVERHEAD * (1 + structure.fields.len()) + names.sum::<usize>()
     });
     let texts = message_type.definitions.values();
     structures.sum::<usize>() + texts.map(|one| one.text.len()).sum::<usize>()

@@ -90,7 +90,7 @@ impl<'a> Search<'a> {
                 .map(DefinitionSource::describe)
                 .unwrap_or_default();
             let (name, announced) = (self.root.clone(), announced.to_owned());
-            return Err(NotFound::Another {
+            return Err(NotFound::OtherDefinition {
                 name,
                 location,
                 found,

@@ -135,7 +135,7 @@ fn every_type_of_the_embedded_packages_has_the_hash_of_its_description() {
 fn description(structure: &Structure) -> Described {
     let mut fields: Vec<_> = structure.fields.iter().map(field_description).collect();
     if fields.is_empty() {
-        fields.push(field(PLACEHOLDER, 3));
+        fields.push(field(PLACEHOLDER_MEMBER, 3));
     }
     described(&structure.name.to_string(), &fields)
 }
@@ -192,7 +192,7 @@ fn a_response_that_is_truncated_or_changed_anywhere_causes_no_panic() {
 }
 
 #[test]
-fn counts_beyond_the_bytes_are_refused_before_memory_is_taken() {
+fn counts_beyond_the_bytes_are_refused_before_memory_is_allocated() {
     let payload = thing().payload();
     // Lengths of lists with one entry, and of empty strings. The first word is `successful`.
     let huge: Vec<_> = (8..payload.len() - 4)
@@ -288,7 +288,10 @@ fn a_lookup_finds_an_offered_type_only_by_its_hash() {
     assert_eq!(library.find(THING, None).unwrap().type_hash(), hash);
     let other = format!("RIHS01_{}", "0".repeat(64));
     let failure = library.find(THING, Some(&other)).unwrap_err();
-    assert!(matches!(failure, NotFound::Another { .. }), "{failure}");
+    assert!(
+        matches!(failure, NotFound::OtherDefinition { .. }),
+        "{failure}"
+    );
     assert!(
         failure.to_string().contains("that a node described"),
         "{failure}"
@@ -364,7 +367,7 @@ fn waiting_responses_and_forged_types_are_bounded_and_do_not_displace_used_ones(
 
 #[test]
 fn a_type_without_fields_is_an_octet() {
-    let empty = described("a/msg/Empty", &[field(PLACEHOLDER, 3)]);
+    let empty = described("a/msg/Empty", &[field(PLACEHOLDER_MEMBER, 3)]);
     let found = described_type(&Response::of(&[empty]).payload()).unwrap();
     let decoded = decode(&found, &[0, 1, 0, 0, 0], &Limits::default()).unwrap();
     let text = yaml::document(&decoded.message, &Default::default(), yaml::Style::Block);

@@ -117,7 +117,7 @@ where
             };
             match (self.find)(hash)? {
                 TypeObject::Alias(other) => {
-                    reference = other.clone().within(reference.shape)?;
+                    reference = other.clone().in_collection(reference.shape)?;
                 }
                 TypeObject::Enumeration(_) if reference.shape != Shape::Single => {
                     return Err(NotUsable::Kind("a collection of enumerations"));

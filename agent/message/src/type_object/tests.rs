@@ -293,7 +293,10 @@ fn a_lookup_finds_the_type_with_the_announced_hash_in_any_order_of_replies() {
             .unwrap_err();
         let other = format!("XTYPES_{}", "0".repeat(28));
         let failure = library.find(THING_NAME, Some(&other)).unwrap_err();
-        assert!(matches!(failure, NotFound::Another { .. }), "{failure}");
+        assert!(
+            matches!(failure, NotFound::OtherDefinition { .. }),
+            "{failure}"
+        );
         let other = format!("RIHS01_{}", "0".repeat(64));
         library.find(THING_NAME, Some(&other)).unwrap_err();
         let figures = library.described_figures();

@@ -15,10 +15,10 @@ use super::exports::{Exports, Outcome, Reason, Signal};
 use super::reports::Report;
 
 /// Pauses before a batch is offered again.
-const FIRST_PAUSE: Duration = Duration::from_secs(1);
-const LONGEST_PAUSE: Duration = Duration::from_secs(30);
+const FIRST_RETRY_DELAY: Duration = Duration::from_secs(1);
+const MAX_RETRY_DELAY: Duration = Duration::from_secs(30);
 /// Time for the last batches, of the two seconds for stopping.
-const LAST: Duration = Duration::from_millis(1_400);
+const LAST_BATCH_TIMEOUT: Duration = Duration::from_millis(1_400);
 
 /// An exporter of the library and the form of its batches.
 pub(super) trait Export {
@@ -38,7 +38,7 @@ pub(super) trait Queue {
     type Batch;
 
     /// Completes once the queue has items.
-    async fn filled(&self);
+    async fn wait_filled(&self);
 
     /// Returns the oldest items, or `None` without any, and the number of items that did not fit.
     fn take(&mut self) -> (Option<Self::Batch>, u64);
@@ -52,12 +52,12 @@ pub(super) struct Delivery<E> {
     exports: Arc<Exports>,
     stop: CancellationToken,
     /// Whether the last request succeeded; `None` before the first.
-    works: Option<bool>,
+    is_working: Option<bool>,
 }
 
 /// Result of the delivery of a batch.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Settled {
+pub(super) enum BatchResult {
     /// The receiver accepted or refused it.
     Answered,
     /// Newer points replace it. It is counted as dropped.
@@ -81,12 +81,12 @@ impl<E: Export> Delivery<E> {
             endpoint,
             exports,
             stop,
-            works: None,
+            is_working: None,
         }
     }
 
     /// Completes when the agent stops.
-    pub(super) async fn stopped(&self) {
+    pub(super) async fn wait_stopped(&self) {
         self.stop.cancelled().await;
     }
 
@@ -101,15 +101,15 @@ impl<E: Export> Delivery<E> {
         let mut left = Vec::new();
         while left.is_empty() {
             let gathered = async {
-                queue.filled().await;
+                queue.wait_filled().await;
                 sleep(gather).await;
             };
             tokio::select! {
                 () = gathered => {}
-                () = self.stopped() => break,
+                () = self.wait_stopped() => break,
             }
             while let Some(batch) = self.next(&mut queue) {
-                if self.deliver(&batch, None).await == Settled::Stopped {
+                if self.deliver(&batch, None).await == BatchResult::Stopped {
                     left.push(batch);
                     break;
                 }
@@ -126,25 +126,29 @@ impl<E: Export> Delivery<E> {
     }
 
     /// Delivers a batch until it is answered, until `newer`, or until the agent stops.
-    pub(super) async fn deliver(&mut self, batch: &E::Batch, newer: Option<Instant>) -> Settled {
+    pub(super) async fn deliver(
+        &mut self,
+        batch: &E::Batch,
+        newer: Option<Instant>,
+    ) -> BatchResult {
         let stop = self.stop.clone();
         let settled = {
             let offers = async {
                 let Some(newer) = newer else {
-                    self.offer(batch).await;
-                    return Settled::Answered;
+                    self.send_until_settled(batch).await;
+                    return BatchResult::Answered;
                 };
-                match timeout_at(newer, self.offer(batch)).await {
-                    Ok(()) => Settled::Answered,
-                    Err(_) => Settled::Overtaken,
+                match timeout_at(newer, self.send_until_settled(batch)).await {
+                    Ok(()) => BatchResult::Answered,
+                    Err(_) => BatchResult::Overtaken,
                 }
             };
             tokio::select! {
                 settled = offers => settled,
-                () = stop.cancelled() => Settled::Stopped,
+                () = stop.cancelled() => BatchResult::Stopped,
             }
         };
-        if settled == Settled::Overtaken {
+        if settled == BatchResult::Overtaken {
             self.failed("no answer before the next export");
             self.count(Outcome::Failed);
             self.superseded(batch);
@@ -159,7 +163,7 @@ impl<E: Export> Delivery<E> {
 
     /// Sends the last batches once each, until one fails.
     pub(super) async fn finish(mut self, batches: Vec<E::Batch>) {
-        let deadline = Instant::now() + LAST;
+        let deadline = Instant::now() + LAST_BATCH_TIMEOUT;
         let mut left = batches.iter();
         while let Some(batch) = left.next() {
             let sent = timeout_at(deadline, self.send(batch, false)).await;
@@ -175,8 +179,8 @@ impl<E: Export> Delivery<E> {
     }
 
     /// Offers a batch until the receiver accepts or refuses it.
-    async fn offer(&mut self, batch: &E::Batch) {
-        let (mut pause, mut is_again) = (FIRST_PAUSE, false);
+    async fn send_until_settled(&mut self, batch: &E::Batch) {
+        let (mut pause, mut is_again) = (FIRST_RETRY_DELAY, false);
         while let Err((error, is_refused)) = self.send(batch, is_again).await {
             self.failed(&error);
             if is_refused {
@@ -185,7 +189,7 @@ impl<E: Export> Delivery<E> {
             }
             is_again = true;
             sleep(pause).await;
-            pause = (pause * 2).min(LONGEST_PAUSE);
+            pause = (pause * 2).min(MAX_RETRY_DELAY);
         }
     }
 
@@ -211,8 +215,8 @@ impl<E: Export> Delivery<E> {
     }
 
     fn delivered(&mut self, rejected: u64) {
-        if self.works != Some(true) {
-            self.works = Some(true);
+        if self.is_working != Some(true) {
+            self.is_working = Some(true);
             tracing::info!(
                 signal = self.signal.label(),
                 endpoint = self.endpoint,
@@ -229,8 +233,8 @@ impl<E: Export> Delivery<E> {
 
     /// Logs the first failure until a request succeeds again.
     fn failed(&mut self, reason: &str) {
-        if self.works != Some(false) {
-            self.works = Some(false);
+        if self.is_working != Some(false) {
+            self.is_working = Some(false);
             tracing::warn!(
                 signal = self.signal.label(),
                 endpoint = self.endpoint,

@@ -165,11 +165,11 @@ fn encoded(exemplar: &Exemplar) -> EncodedExemplar {
 
 /// Sends requests with such points over the connection of an exporter, with the exporter's headers.
 pub(super) struct EncodedSender {
-    way: Way,
+    protocol: Protocol,
     headers: SentHeaders,
 }
 
-enum Way {
+enum Protocol {
     Grpc(MetricsServiceClient<Channel>),
     Http(Arc<dyn HttpClient>, Uri),
 }
@@ -182,14 +182,14 @@ impl EncodedSender {
             client = client.send_compressed(CompressionEncoding::Gzip);
         }
         Self {
-            way: Way::Grpc(client),
+            protocol: Protocol::Grpc(client),
             headers,
         }
     }
 
     pub(super) fn http(client: Arc<dyn HttpClient>, endpoint: Uri, headers: SentHeaders) -> Self {
         Self {
-            way: Way::Http(client, endpoint),
+            protocol: Protocol::Http(client, endpoint),
             headers,
         }
     }
@@ -202,8 +202,8 @@ impl EncodedSender {
             .lock()
             .unwrap_or_else(PoisonError::into_inner)
             .clone();
-        let response = match &self.way {
-            Way::Grpc(client) => {
+        let response = match &self.protocol {
+            Protocol::Grpc(client) => {
                 reports::attempt();
                 let mut request = tonic::Request::new(request.clone());
                 *request.metadata_mut() = MetadataMap::from_headers(headers);
@@ -222,7 +222,7 @@ impl EncodedSender {
                     }
                 }
             }
-            Way::Http(client, endpoint) => {
+            Protocol::Http(client, endpoint) => {
                 let mut body = request.encode_to_vec();
                 if headers.get(CONTENT_ENCODING).is_some_and(|it| it == "gzip") {
                     let mut gzip = GzEncoder::new(Vec::new(), flate2::Compression::default());

@@ -3,7 +3,7 @@
 use tonic::codegen::http::Uri;
 
 /// Default port of receivers.
-const PORT: u16 = 4317;
+const OTLP_PORT: u16 = 4317;
 
 /// Parses a URL for gRPC: scheme and authority. A path after them belongs to OTLP over HTTP and is
 /// dropped. `None` if the text is not such a URL.
@@ -17,7 +17,7 @@ pub fn otlp_endpoint(text: &str) -> Option<Uri> {
     let authority = match authority.port_u16() {
         Some(_) => authority.to_string(),
         None if authority.as_str().contains('@') || authority.host().is_empty() => return None,
-        None => format!("{}:{PORT}", authority.host()),
+        None => format!("{}:{OTLP_PORT}", authority.host()),
     };
     Uri::builder()
         .scheme(scheme)

@@ -20,9 +20,9 @@ use super::delivery::{Export, Queue};
 use crate::event::{self, Batch, EventSource, Record, Value};
 
 /// Time for which events are collected into one request.
-pub(super) const GATHER: Duration = Duration::from_millis(500);
+pub(super) const BATCH_DELAY: Duration = Duration::from_millis(500);
 /// Maximum number of events per request: about 200 KB.
-const MOST: usize = 256;
+const MAX_EVENTS: usize = 256;
 
 /// Exports log records.
 pub(super) struct LogExport {
@@ -83,7 +83,7 @@ impl Reporter {
 impl Queue for Reporter {
     type Batch = Vec<SdkLogRecord>;
 
-    async fn filled(&self) {
+    async fn wait_filled(&self) {
         self.log.wait_after(self.place).await;
     }
 
@@ -92,7 +92,7 @@ impl Queue for Reporter {
             lagged,
             records,
             last,
-        } = self.log.read_after(self.place, MOST);
+        } = self.log.read_after(self.place, MAX_EVENTS);
         self.place = last;
         let records = records.iter().map(|record| self.log_record(record));
         let records: Vec<_> = records.collect();

@@ -154,22 +154,22 @@ impl Jobs {
         };
         let events = async {
             if let Some((reporter, delivery)) = self.events {
-                delivery.drain(reporter, events::GATHER).await;
+                delivery.drain(reporter, events::BATCH_DELAY).await;
             }
         };
         let traces = async {
             if let Some((tracing, delivery)) = self.traces {
-                delivery.drain(tracing, traces::GATHER).await;
+                delivery.drain(tracing, traces::BATCH_DELAY).await;
             }
         };
         let log = async {
             if let Some((queue, delivery)) = self.log {
-                delivery.drain(&*queue, own_log::GATHER).await;
+                delivery.drain(&*queue, own_log::BATCH_DELAY).await;
             }
         };
         let node_logs = async {
             if let Some((logs, delivery)) = self.node_logs {
-                delivery.drain(logs, node_logs::GATHER).await;
+                delivery.drain(logs, node_logs::BATCH_DELAY).await;
             }
         };
         tokio::join!(metrics, events, traces, log, node_logs);

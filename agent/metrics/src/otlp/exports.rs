@@ -174,7 +174,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn signals_are_counted_apart_and_only_enabled_ones_are_shown() {
+    fn signals_are_counted_separately_and_only_enabled_ones_are_exported() {
         let exports = Exports::default();
         assert_eq!(exports.signals().count(), 0);
         exports.enable(Signal::Traces);

@@ -98,7 +98,7 @@ impl Observed {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn whole(self, metric: &'static Metric) -> impl Fn(&dyn AsyncInstrument<u64>) {
+    fn add_integers(self, metric: &'static Metric) -> impl Fn(&dyn AsyncInstrument<u64>) {
         move |observer| {
             for (value, attributes) in self.points().of(metric) {
                 if let Number::Count(count) = value {
@@ -109,7 +109,7 @@ impl Observed {
         }
     }
 
-    fn real(self, metric: &'static Metric) -> impl Fn(&dyn AsyncInstrument<f64>) {
+    fn add_floats(self, metric: &'static Metric) -> impl Fn(&dyn AsyncInstrument<f64>) {
         move |observer| {
             for (value, attributes) in self.points().of(metric) {
                 if let Number::Real(real) = value {
@@ -182,11 +182,11 @@ fn counter(meter: &Meter, metric: &'static Metric, observed: Observed) {
     if is_real(metric) {
         let counter = meter.f64_observable_counter(name);
         let counter = counter.with_description(help).with_unit(unit);
-        counter.with_callback(observed.real(metric)).build();
+        counter.with_callback(observed.add_floats(metric)).build();
     } else {
         let counter = meter.u64_observable_counter(name);
         let counter = counter.with_description(help).with_unit(unit);
-        counter.with_callback(observed.whole(metric)).build();
+        counter.with_callback(observed.add_integers(metric)).build();
     }
 }
 
@@ -196,12 +196,16 @@ fn gauge(meter: &Meter, metric: &'static Metric, observed: &Observed) {
     if whole {
         let gauge = meter.u64_observable_gauge(name.clone());
         let gauge = gauge.with_description(help).with_unit(unit);
-        gauge.with_callback(observed.clone().whole(metric)).build();
+        gauge
+            .with_callback(observed.clone().add_integers(metric))
+            .build();
     }
     if real {
         let gauge = meter.f64_observable_gauge(name);
         let gauge = gauge.with_description(help).with_unit(unit);
-        gauge.with_callback(observed.clone().real(metric)).build();
+        gauge
+            .with_callback(observed.clone().add_floats(metric))
+            .build();
     }
 }
 

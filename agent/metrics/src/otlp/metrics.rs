@@ -12,7 +12,7 @@ use opentelemetry_sdk::error::OTelSdkResult;
 use opentelemetry_sdk::metrics::exporter::PushMetricExporter as _;
 use tokio::time::{MissedTickBehavior, interval_at};
 
-use super::delivery::{Delivery, Export, Settled};
+use super::delivery::{BatchResult, Delivery, Export};
 use super::encoded::EncodedSender;
 use super::points::{Batch, Collection, Points};
 use crate::metric_sink::MetricSink;
@@ -72,7 +72,7 @@ impl Collector {
         loop {
             let now = tokio::select! {
                 now = ticks.tick() => now,
-                () = delivery.stopped() => break,
+                () = delivery.wait_stopped() => break,
             };
             self.source.refresh(REFRESH_TIMEOUT).await;
             let Collection { batches, dropped } = self.collect(SystemTime::now());
@@ -84,9 +84,9 @@ impl Collector {
                     continue;
                 }
                 is_overtaken = match delivery.deliver(&batch, Some(now + period)).await {
-                    Settled::Answered => false,
-                    Settled::Overtaken => true,
-                    Settled::Stopped => {
+                    BatchResult::Answered => false,
+                    BatchResult::Overtaken => true,
+                    BatchResult::Stopped => {
                         // The last collection replaces the batch.
                         delivery.superseded(&batch);
                         true

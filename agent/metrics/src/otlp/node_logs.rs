@@ -17,9 +17,9 @@ use super::waiting::Waiting;
 use crate::tables::WaitingNodeLogs;
 
 /// Maximum number of messages in one request.
-const REQUEST: usize = 256;
+const MAX_PER_REQUEST: usize = 256;
 /// Time for which messages are collected into one request.
-pub(super) const GATHER: Duration = Duration::from_millis(500);
+pub(super) const BATCH_DELAY: Duration = Duration::from_millis(500);
 
 /// The queue of messages between the capture thread and the exporter.
 #[derive(Debug, Default)]
@@ -64,13 +64,13 @@ pub(super) struct NodeLogs {
 impl Queue for NodeLogs {
     type Batch = Vec<SdkLogRecord>;
 
-    async fn filled(&self) {
-        self.queue.0.filled().await;
+    async fn wait_filled(&self) {
+        self.queue.0.wait_filled().await;
     }
 
     /// The sink counts messages that do not fit.
     fn take(&mut self) -> (Option<Vec<SdkLogRecord>>, u64) {
-        let taken = self.queue.0.take(REQUEST);
+        let taken = self.queue.0.take(MAX_PER_REQUEST);
         let records: Vec<_> = taken.iter().map(|log| self.record(log)).collect();
         ((!records.is_empty()).then_some(records), 0)
     }
@@ -176,7 +176,7 @@ mod tests {
     }
 
     #[test]
-    fn a_record_has_severity_place_times_and_trace_of_its_message() {
+    fn a_log_record_has_severity_location_times_and_trace_of_its_message() {
         let logs = NodeLogs::new(Arc::default());
         let record = logs.record(&new_log(LogLevel::Fatal));
         let logged = SystemTime::UNIX_EPOCH + Duration::new(1_700_000_000, 5);
@@ -195,11 +195,11 @@ mod tests {
     fn only_messages_of_the_level_are_queued_and_losses_count() {
         let sink = sink(Some(LogLevel::Warn));
         sink.add(LogLevel::ALL.map(new_log).to_vec(), 4);
-        assert_eq!(sink.queue.0.take(REQUEST).len(), 3);
+        assert_eq!(sink.queue.0.take(MAX_PER_REQUEST).len(), 3);
         assert_eq!(sink.exports.dropped(Signal::NodeLogs, Reason::Overflow), 4);
         let off = self::sink(None);
         off.add(LogLevel::ALL.map(new_log).to_vec(), 0);
-        assert!(off.queue.0.take(REQUEST).is_empty());
+        assert!(off.queue.0.take(MAX_PER_REQUEST).is_empty());
     }
 
     #[test]
@@ -207,7 +207,7 @@ mod tests {
         let sink = sink(Some(LogLevel::Warn));
         sink.add(vec![new_log(LogLevel::Error); WaitingNodeLogs::CAP + 3], 0);
         assert_eq!(sink.exports.dropped(Signal::NodeLogs, Reason::Overflow), 3);
-        assert_eq!(sink.queue.0.take(REQUEST).len(), REQUEST);
+        assert_eq!(sink.queue.0.take(MAX_PER_REQUEST).len(), MAX_PER_REQUEST);
     }
 
     #[test]

@@ -24,13 +24,13 @@ use super::delivery::Queue;
 
 /// Maximum number of lines in the queue, their maximum size in bytes, and the maximum number of
 /// lines in one request.
-const LINES: usize = 1024;
+const MAX_LINES: usize = 1024;
 const LINES_BYTES: usize = 1 << 20;
-const REQUEST: usize = 256;
+const MAX_PER_REQUEST: usize = 256;
 /// Time for which lines are collected into one request.
-pub(super) const GATHER: Duration = Duration::from_millis(500);
+pub(super) const BATCH_DELAY: Duration = Duration::from_millis(500);
 /// Estimated size of a record or an attribute without its texts.
-const OVERHEAD: usize = 64;
+const RECORD_OVERHEAD: usize = 64;
 
 /// The queue of lines between the threads that log and the exporter.
 #[derive(Debug, Default)]
@@ -63,7 +63,7 @@ impl LogQueue {
     fn put(&self, line: SdkLogRecord) {
         let bytes = size(&line);
         let mut waiting = self.waiting();
-        if waiting.lines.len() >= LINES || waiting.bytes + bytes > LINES_BYTES {
+        if waiting.lines.len() >= MAX_LINES || waiting.bytes + bytes > LINES_BYTES {
             self.overflowed.fetch_add(1, Ordering::Relaxed);
             return;
         }
@@ -76,7 +76,7 @@ impl LogQueue {
     /// Returns the oldest lines; `None` if the queue is empty.
     fn take(&self) -> Option<Vec<SdkLogRecord>> {
         let mut waiting = self.waiting();
-        let most = waiting.lines.len().min(REQUEST);
+        let most = waiting.lines.len().min(MAX_PER_REQUEST);
         let lines: Vec<_> = waiting.lines.drain(..most).collect();
         waiting.bytes -= lines.iter().map(size).sum::<usize>().min(waiting.bytes);
         (!lines.is_empty()).then_some(lines)
@@ -100,7 +100,7 @@ impl LogQueue {
 impl Queue for &LogQueue {
     type Batch = Vec<SdkLogRecord>;
 
-    async fn filled(&self) {
+    async fn wait_filled(&self) {
         LogQueue::filled(self).await;
     }
 
@@ -132,9 +132,9 @@ fn size(record: &SdkLogRecord) -> usize {
     };
     let attributes = record.attributes_iter();
     let attributes: usize = attributes
-        .map(|(key, value)| OVERHEAD + key.as_str().len() + text(value))
+        .map(|(key, value)| RECORD_OVERHEAD + key.as_str().len() + text(value))
         .sum();
-    OVERHEAD + record.body().map_or(0, text) + attributes
+    RECORD_OVERHEAD + record.body().map_or(0, text) + attributes
 }
 
 #[cfg(test)]
@@ -174,11 +174,11 @@ mod tests {
     #[test]
     fn the_queue_bounds_lines_and_bytes_and_counts_overflowing_lines() {
         let (queue, lines) = queued(|| {
-            for line in 0..LINES + 5 {
+            for line in 0..MAX_LINES + 5 {
                 tracing::warn!(line, "short");
             }
         });
-        assert_eq!(lines.len(), LINES);
+        assert_eq!(lines.len(), MAX_LINES);
         assert_eq!(queue.overflowed.load(Ordering::Relaxed), 5);
         assert_eq!(queue.waiting().bytes, 0);
 

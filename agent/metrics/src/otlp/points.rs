@@ -32,7 +32,7 @@ const BUCKET_BYTES: usize = 17;
 const EXEMPLAR_BYTES: usize = 38;
 const ATTRIBUTE_BYTES: usize = 8;
 /// Name of the instrumentation scope. Queries use it, so it does not follow the name of this crate.
-const SCOPE: &str = "ros2probe-daemon";
+const SCOPE_NAME: &str = "ros2probe-daemon";
 
 /// Gathers one collection after the other.
 pub struct Points {
@@ -261,7 +261,7 @@ impl Gathered<instruments::Points> {
 
 /// Returns the instrumentation scope of all signals.
 pub(super) fn scope() -> InstrumentationScope {
-    InstrumentationScope::builder(SCOPE)
+    InstrumentationScope::builder(SCOPE_NAME)
         .with_version(env!("CARGO_PKG_VERSION"))
         .build()
 }
@@ -535,7 +535,7 @@ mod tests {
     }
 
     #[test]
-    fn real_numbers_stay_real_and_an_unknown_lag_stays_infinite() {
+    fn floats_stay_floats_and_an_unknown_lag_stays_infinite() {
         let mut points = empty();
         points.begin(1);
         points.open(metric("process_cpu_seconds_total"));

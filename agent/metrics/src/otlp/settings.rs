@@ -22,8 +22,8 @@ use super::exports::Signal;
 use super::resource::{Host, resource};
 
 /// Default interval of metric exports, and default timeout of a request.
-const INTERVAL: Duration = Duration::from_secs(15);
-const TIMEOUT: Duration = Duration::from_secs(10);
+const DEFAULT_INTERVAL: Duration = Duration::from_secs(15);
+const DEFAULT_TIMEOUT: Duration = Duration::from_secs(10);
 /// Maximum size of a file with headers, in bytes.
 const HEADERS_BYTES: u64 = 1 << 20;
 
@@ -200,7 +200,7 @@ impl Settings {
                 let variable = variables.find("OTEL_METRIC_EXPORT_INTERVAL");
                 variable
                     .and_then(|value| milliseconds("OTEL_METRIC_EXPORT_INTERVAL", &value))
-                    .unwrap_or(INTERVAL)
+                    .unwrap_or(DEFAULT_INTERVAL)
                     .max(Duration::from_secs(1))
             }),
             metrics: target(Signal::Metrics)?,
@@ -319,7 +319,7 @@ fn target(
         is_grpc,
         endpoint,
         headers: headers(file, read)?,
-        timeout: timeout.unwrap_or(TIMEOUT),
+        timeout: timeout.unwrap_or(DEFAULT_TIMEOUT),
         gzip,
     }))
 }
@@ -407,7 +407,7 @@ mod tests {
     }
 
     #[test]
-    fn without_an_endpoint_nothing_is_exported() {
+    fn without_an_endpoint_the_exporter_is_disabled() {
         let unset = OtlpSettings::default();
         assert!(resolve(&unset, &[]).unwrap().is_none());
         let set = [("OTEL_EXPORTER_OTLP_ENDPOINT", "http://collector:4317")];
@@ -435,7 +435,7 @@ mod tests {
     }
 
     #[test]
-    fn standard_variables_are_honoured() {
+    fn standard_otel_variables_are_applied() {
         let settings = resolve(
             &OtlpSettings::default(),
             &[

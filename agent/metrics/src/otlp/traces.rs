@@ -32,11 +32,11 @@ use ros2probe_model::facts::calls::facts::NewLateCalls;
 use ros2probe_model::facts::identity::Identity;
 
 /// Maximum number of spans in one request.
-const REQUEST: usize = 512;
+const MAX_PER_REQUEST: usize = 512;
 /// Time for which spans are collected into one request.
-pub(super) const GATHER: Duration = Duration::from_secs(1);
+pub(super) const BATCH_DELAY: Duration = Duration::from_secs(1);
 /// W3C trace flags: sampled, and a random trace id.
-const FLAGS: u8 = 0b11;
+const TRACE_FLAGS: u8 = 0b11;
 
 /// The queue of spans between the capture thread and the exporter.
 #[derive(Debug, Default)]
@@ -91,7 +91,9 @@ impl SpanSink {
         let calls = late.calls.iter();
         let refused = calls.map(|(domain_id, example)| {
             let spans = LateSpan::of(*domain_id, example).into_iter();
-            self.queue.0.put_whole(spans.map(QueuedSpan::LateCall))
+            self.queue
+                .0
+                .add_all_or_none(spans.map(QueuedSpan::LateCall))
         });
         late.lost + refused.sum::<u64>()
     }
@@ -123,13 +125,13 @@ pub(super) struct Tracing {
 impl Queue for Tracing {
     type Batch = Vec<SpanData>;
 
-    async fn filled(&self) {
-        self.queue.0.filled().await;
+    async fn wait_filled(&self) {
+        self.queue.0.wait_filled().await;
     }
 
     /// The sink counts spans that do not fit.
     fn take(&mut self) -> (Option<Vec<SpanData>>, u64) {
-        let spans = self.queue.0.take(REQUEST);
+        let spans = self.queue.0.take(MAX_PER_REQUEST);
         let exported = spans.iter().map(|span| match span {
             QueuedSpan::Message(span) => self.of_message(span),
             QueuedSpan::Chain(span) => self.exported(chains::parts(span, self.host)),
@@ -215,7 +217,7 @@ impl Tracing {
 }
 
 fn context(trace_id: u128, id: u64) -> SpanContext {
-    let flags = TraceFlags::new(FLAGS);
+    let flags = TraceFlags::new(TRACE_FLAGS);
     let (trace_id, id) = (TraceId::from(trace_id), SpanId::from(id));
     SpanContext::new(trace_id, id, flags, false, TraceState::NONE)
 }
@@ -334,7 +336,7 @@ mod tests {
         );
         let sent = one.of_message(&span(SpanStage::Send));
         assert_eq!(sent, two.of_message(&span(SpanStage::Send)));
-        assert_eq!(sent.span_context.trace_flags().to_u8(), FLAGS);
+        assert_eq!(sent.span_context.trace_flags().to_u8(), TRACE_FLAGS);
         assert_eq!(sent.name, "send /points");
         assert_eq!(sent.parent_span_id, SpanId::INVALID);
         let received = [&one, &two].map(|tracing| tracing.of_message(&span(SpanStage::Receive)));
@@ -358,10 +360,10 @@ mod tests {
         assert_eq!(queue.0.put(Vec::new()), 0);
         assert_eq!(queue.0.put(spans(WaitingSpans::CAP - 1)), 0);
         assert_eq!(queue.0.put(spans(3)), 2);
-        queue.0.filled().await;
+        queue.0.wait_filled().await;
         let mut taken = 0;
-        while let more @ 1.. = queue.0.take(REQUEST).len() {
-            assert!(more <= REQUEST);
+        while let more @ 1.. = queue.0.take(MAX_PER_REQUEST).len() {
+            assert!(more <= MAX_PER_REQUEST);
             taken += more;
         }
         assert_eq!(taken, WaitingSpans::CAP);

@@ -24,7 +24,7 @@ use super::reports;
 use super::settings::{SettingsError, Target};
 
 /// Interval of HTTP/2 pings; a connection that does not answer a ping is reopened.
-const PING: Duration = Duration::from_secs(30);
+const PING_INTERVAL: Duration = Duration::from_secs(30);
 
 /// The connection of a signal; opened at the first request, and again after a failure.
 pub(super) struct Transport {
@@ -158,7 +158,7 @@ fn channel(target: &Target) -> Result<Channel, SettingsError> {
     let endpoint = endpoint
         .connect_timeout(target.timeout)
         .timeout(target.timeout)
-        .http2_keep_alive_interval(PING);
+        .http2_keep_alive_interval(PING_INTERVAL);
     Ok(endpoint.connect_lazy())
 }
 

@@ -37,7 +37,7 @@ impl<D: Declared, T> Waiting<D, T> {
     }
 
     /// Appends all of these items, or none. Returns the number of items that did not fit.
-    pub(super) fn put_whole(&self, items: impl ExactSizeIterator<Item = T>) -> u64 {
+    pub(super) fn add_all_or_none(&self, items: impl ExactSizeIterator<Item = T>) -> u64 {
         let count = items.len();
         let mut waiting = self.items();
         if waiting.len() + count > D::TABLE.entries {
@@ -59,7 +59,7 @@ impl<D: Declared, T> Waiting<D, T> {
     }
 
     /// Completes once an item waits.
-    pub(super) async fn filled(&self) {
+    pub(super) async fn wait_filled(&self) {
         loop {
             let added = self.added.notified();
             if !self.items().is_empty() {

@@ -2,8 +2,8 @@
 //! of reach.
 //!
 //! Samples leave in the order in which they were collected. Those on disk are older than those in
-//! memory. Samples of a request in progress stay here until they are delivered or refused, so that a
-//! sudden end loses none that are on disk.
+//! memory. Samples of a request in progress stay here until they are delivered or refused, so that
+//! a sudden end loses none that are on disk.
 
 use std::collections::VecDeque;
 use std::io;
@@ -51,7 +51,7 @@ struct Disk {
     writer: Writer,
     reader: Reader,
     /// Whether the last record was written.
-    works: bool,
+    is_working: bool,
     /// Whether the last record was read.
     can_read: bool,
 }
@@ -204,15 +204,15 @@ impl Disk {
             queue,
             writer: Writer::default(),
             reader: Reader::default(),
-            works: true,
+            is_working: true,
             can_read: true,
         }
     }
 
-    /// Appends a scrape. Calls `lose` with the number of samples of each scrape that is lost for it.
-    /// Returns whether it is on disk.
+    /// Appends a scrape. Calls `lose` with the number of samples of each scrape that is lost for
+    /// it. Returns whether it is on disk.
     fn append(&mut self, scrape: &Scrape, lose: &mut dyn FnMut(usize)) -> bool {
-        if self.queue.begins_file() || self.writer.is_full() || !self.works {
+        if self.queue.begins_file() || self.writer.is_full() || !self.is_working {
             self.queue.begin_file();
             self.writer = Writer::default();
         }
@@ -238,14 +238,14 @@ impl Disk {
             },
         );
         match appended {
-            Ok(()) => self.works = true,
+            Ok(()) => self.is_working = true,
             Err(error) => {
-                if std::mem::replace(&mut self.works, false) {
+                if std::mem::replace(&mut self.is_working, false) {
                     tracing::warn!(%error, "cannot write samples for remote write to disk");
                 }
             }
         }
-        self.works
+        self.is_working
     }
 
     /// Returns the next waiting scrape; `None` after the last one. Logs the first failure until a
@@ -438,7 +438,7 @@ mod tests {
     }
 
     #[test]
-    fn series_that_come_and_go_begin_a_new_file() {
+    fn changing_series_begin_a_new_file() {
         let directory = tempfile::tempdir().unwrap();
         let mut backlog = opened(directory.path());
         for at in 0..4_u32 {

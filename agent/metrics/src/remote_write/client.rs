@@ -22,13 +22,13 @@ use tokio_rustls::rustls::{ClientConfig, RootCertStore};
 use super::request::Version;
 use super::settings::{Settings, SettingsError};
 
-const VERSION: HeaderName = HeaderName::from_static("x-prometheus-remote-write-version");
+const VERSION_HEADER: HeaderName = HeaderName::from_static("x-prometheus-remote-write-version");
 /// Number of samples that a receiver of version 2.0 wrote.
-const WRITTEN: &str = "x-prometheus-remote-write-samples-written";
+const SAMPLES_WRITTEN_HEADER: &str = "x-prometheus-remote-write-samples-written";
 /// Maximum length of an answer that is read, in bytes.
 const ANSWER_BYTES: usize = 4 << 10;
 /// Maximum length of a reason in the log, in characters.
-const REASON: usize = 200;
+const MAX_REASON: usize = 200;
 /// Maximum pause that a receiver may demand.
 const LONGEST_PAUSE: Duration = Duration::from_mins(5);
 
@@ -44,17 +44,17 @@ pub(super) struct Client {
 
 /// Answer to a request.
 #[derive(Debug, PartialEq, Eq)]
-pub(super) enum Answer {
+pub(super) enum WriteResult {
     /// The receiver wrote all samples.
     Accepted,
     /// The request may succeed later; at the earliest after this time.
-    Again(String, Option<Duration>),
+    RetryLater(String, Option<Duration>),
     /// The receiver refuses these samples. It wrote this number of them, if it knows.
     Refused(String, Option<u64>),
     /// The receiver does not know this version.
     UnknownVersion,
-    /// A success that does not state what was written: of a receiver that does not know version 2.0,
-    /// or of something between it and the robot.
+    /// A success that does not state what was written: of a receiver that does not know version
+    /// 2.0, or of something between it and the robot.
     Unconfirmed,
 }
 
@@ -75,7 +75,7 @@ impl Client {
     /// Uses replaced files from now on.
     ///
     /// Fails if a file cannot be used. The previous ones remain in use then.
-    pub(super) fn renew(&mut self) -> Result<(), SettingsError> {
+    pub(super) fn reload_files(&mut self) -> Result<(), SettingsError> {
         let files = self.settings.changed();
         if files != self.files {
             self.connections = connections(&self.settings)?;
@@ -85,10 +85,10 @@ impl Client {
     }
 
     /// Sends a body once.
-    pub(super) async fn send(&self, body: Bytes, version: Version) -> Answer {
+    pub(super) async fn send(&self, body: Bytes, version: Version) -> WriteResult {
         let request = match self.request(body, version) {
             Ok(request) => request,
-            Err(error) => return Answer::Again(in_words(&error), None),
+            Err(error) => return WriteResult::RetryLater(in_words(&error), None),
         };
         let answered = async {
             let response = self.connections.request(request).await;
@@ -100,8 +100,8 @@ impl Client {
         };
         match timeout(self.settings.timeout, answered).await {
             Ok(Ok(response)) => answer(&response, version),
-            Ok(Err(reason)) => Answer::Again(reason, None),
-            Err(_) => Answer::Again("no answer in time".to_owned(), None),
+            Ok(Err(reason)) => WriteResult::RetryLater(reason, None),
+            Err(_) => WriteResult::RetryLater("no answer in time".to_owned(), None),
         }
     }
 
@@ -117,7 +117,7 @@ impl Client {
         for (name, value) in [
             (CONTENT_ENCODING, "snappy"),
             (CONTENT_TYPE, version.content_type()),
-            (VERSION, version.header()),
+            (VERSION_HEADER, version.header()),
             (USER_AGENT, concat!("ros2probe/", env!("CARGO_PKG_VERSION"))),
         ] {
             headers.insert(name, HeaderValue::from_static(value));
@@ -189,9 +189,9 @@ fn certificates(text: &str) -> Option<Vec<CertificateDer<'static>>> {
 }
 
 /// Interprets a response (Prometheus Remote-Write 2.0, "Responses").
-fn answer(response: &Response<Bytes>, version: Version) -> Answer {
+fn answer(response: &Response<Bytes>, version: Version) -> WriteResult {
     let (status, headers) = (response.status(), response.headers());
-    let written = headers.get(WRITTEN).and_then(number);
+    let written = headers.get(SAMPLES_WRITTEN_HEADER).and_then(number);
     // A receiver of version 1.0 ignores a body of version 2.0, or cannot parse it.
     let is_old = matches!(
         status,
@@ -199,22 +199,22 @@ fn answer(response: &Response<Bytes>, version: Version) -> Answer {
     );
     if version == Version::Two && written.is_none() {
         if is_old {
-            return Answer::UnknownVersion;
+            return WriteResult::UnknownVersion;
         }
         if status.is_success() {
-            return Answer::Unconfirmed;
+            return WriteResult::Unconfirmed;
         }
     }
     if status.is_success() {
-        return Answer::Accepted;
+        return WriteResult::Accepted;
     }
     let text = String::from_utf8_lossy(response.body());
-    let text: String = text.trim().chars().take(REASON).collect();
+    let text: String = text.trim().chars().take(MAX_REASON).collect();
     let reason = format!("{status}: {text}");
     if status.is_server_error() || is_temporary(status) {
-        Answer::Again(reason, pause(headers))
+        WriteResult::RetryLater(reason, pause(headers))
     } else {
-        Answer::Refused(reason, written)
+        WriteResult::Refused(reason, written)
     }
 }
 
@@ -266,18 +266,25 @@ mod tests {
         };
         let one = |response: &_| answer(response, Version::One);
         let two = |response: &_| answer(response, Version::Two);
-        let again = |text: &str, pause| Answer::Again(text.to_owned(), pause);
-        assert_eq!(one(&reply(204, &[], "")), Answer::Accepted);
-        assert_eq!(two(&reply(204, &[(WRITTEN, "3")], "")), Answer::Accepted);
-        assert_eq!(two(&reply(204, &[], "")), Answer::Unconfirmed);
+        let again = |text: &str, pause| WriteResult::RetryLater(text.to_owned(), pause);
+        assert_eq!(one(&reply(204, &[], "")), WriteResult::Accepted);
+        assert_eq!(
+            two(&reply(204, &[(SAMPLES_WRITTEN_HEADER, "3")], "")),
+            WriteResult::Accepted
+        );
+        assert_eq!(two(&reply(204, &[], "")), WriteResult::Unconfirmed);
         for status in [400, 415] {
-            assert_eq!(two(&reply(status, &[], "")), Answer::UnknownVersion);
+            assert_eq!(two(&reply(status, &[], "")), WriteResult::UnknownVersion);
         }
         let old = one(&reply(400, &[], "out of order\n"));
         let reason = "400 Bad Request: out of order".to_owned();
-        assert_eq!(old, Answer::Refused(reason.clone(), None));
-        let partly = two(&reply(400, &[(WRITTEN, "2")], "out of order"));
-        assert_eq!(partly, Answer::Refused(reason, Some(2)));
+        assert_eq!(old, WriteResult::Refused(reason.clone(), None));
+        let partly = two(&reply(
+            400,
+            &[(SAMPLES_WRITTEN_HEADER, "2")],
+            "out of order",
+        ));
+        assert_eq!(partly, WriteResult::Refused(reason, Some(2)));
         let pause = Some(Duration::from_secs(7));
         let busy = reply(429, &[("retry-after", "7")], "");
         assert_eq!(two(&busy), again("429 Too Many Requests: ", pause));

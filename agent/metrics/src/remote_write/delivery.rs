@@ -13,8 +13,8 @@ use tokio::time::{MissedTickBehavior, interval_at, sleep};
 use tokio_util::sync::CancellationToken;
 
 use super::backlog::Backlog;
-use super::client::{Answer, Client};
-use super::figures::{Fate, Figures, Request, now};
+use super::client::{Client, WriteResult};
+use super::figures::{Figures, Request, SampleFate, now};
 use super::request::{Version, body};
 use super::samples::{Samples, Scrape};
 use super::settings::{Settings, SettingsError};
@@ -26,7 +26,7 @@ use crate::metric_source::MetricSource;
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
 const LONGEST_PAUSE: Duration = Duration::from_secs(30);
 /// Time for the last requests, of the two seconds for stopping.
-const LAST: Duration = Duration::from_millis(1_400);
+const LAST_REQUEST_TIMEOUT: Duration = Duration::from_millis(1_400);
 /// Maximum time to wait for fresh figures.
 const REFRESH_TIMEOUT: Duration = Duration::from_millis(500);
 
@@ -112,7 +112,7 @@ struct Sender<'a> {
     /// Whether the receiver answered in `version` before.
     is_known: bool,
     /// Whether the last request succeeded; `None` before the first.
-    works: Option<bool>,
+    is_working: Option<bool>,
     /// Whether a refusal was logged since the last success.
     is_refusal_logged: bool,
 }
@@ -151,7 +151,7 @@ impl Job {
             client,
             version: Version::Two,
             is_known: false,
-            works: None,
+            is_working: None,
             is_refusal_logged: false,
         };
         let deliver = async {
@@ -163,16 +163,16 @@ impl Job {
         tokio::join!(self.collect(&*metrics), deliver);
         self.waiting.change(&self.figures, |state| {
             let lost = state.backlog.write();
-            self.figures.count_samples(Fate::Overflow, lost);
+            self.figures.count_samples(SampleFate::Overflow, lost);
             let dropped = state.backlog.clear();
-            self.figures.count_samples(Fate::Shutdown, dropped);
+            self.figures.count_samples(SampleFate::Shutdown, dropped);
         });
     }
 
     /// Completes when the time for the last requests is over.
     async fn ended(&self) {
         self.stop.cancelled().await;
-        sleep(LAST).await;
+        sleep(LAST_REQUEST_TIMEOUT).await;
     }
 
     /// Collects at each interval until the agent stops, and then a last time.
@@ -200,7 +200,7 @@ impl Job {
             let at = now();
             let (scrape, refused) = samples.end(if at == last { at + 1 } else { at });
             last = scrape.at;
-            self.figures.count_samples(Fate::Overflow, refused);
+            self.figures.count_samples(SampleFate::Overflow, refused);
             self.add(scrape);
             if stops {
                 break;
@@ -214,7 +214,7 @@ impl Job {
     fn add(&self, scrape: Scrape) {
         self.waiting.change(&self.figures, |state| {
             let lost = state.backlog.add(scrape, !state.fails);
-            self.figures.count_samples(Fate::Overflow, lost);
+            self.figures.count_samples(SampleFate::Overflow, lost);
         });
     }
 
@@ -251,11 +251,11 @@ impl Sender<'_> {
         // A receiver that refuses some samples may refuse the whole request, so parts follow.
         let mut parts = vec![batch];
         while let Some(part) = parts.pop() {
-            match self.offer(part).await {
+            match self.send_until_settled(part).await {
                 Ok(()) => self
                     .job
                     .figures
-                    .count_samples(Fate::Delivered, samples(part)),
+                    .count_samples(SampleFate::Delivered, samples(part)),
                 Err((_, None)) if part.len() > 1 => {
                     let (older, newer) = part.split_at(part.len() / 2);
                     parts.extend([newer, older]);
@@ -269,26 +269,29 @@ impl Sender<'_> {
 
     /// Sends samples until the receiver writes or refuses them. An error has its reason, and the
     /// number of samples that the receiver wrote.
-    async fn offer(&mut self, part: &[Arc<Scrape>]) -> Result<(), (String, Option<u64>)> {
+    async fn send_until_settled(
+        &mut self,
+        part: &[Arc<Scrape>],
+    ) -> Result<(), (String, Option<u64>)> {
         let mut pause = FIRST_PAUSE;
         let mut body = self.body(part);
         loop {
-            if let Err(error) = self.client.renew() {
+            if let Err(error) = self.client.reload_files() {
                 self.failed(&error.to_string());
             }
             let length = body.len();
             let answer = match self.client.send(body.clone(), self.version).await {
                 // A receiver of version 2.0 states it, but the portal of a network does not.
-                Answer::Unconfirmed if self.is_known => {
+                WriteResult::Unconfirmed if self.is_known => {
                     let reason = "a success without the number of written samples";
-                    Answer::Again(reason.to_owned(), None)
+                    WriteResult::RetryLater(reason.to_owned(), None)
                 }
-                Answer::Unconfirmed => Answer::UnknownVersion,
+                WriteResult::Unconfirmed => WriteResult::UnknownVersion,
                 answer => answer,
             };
             let figures = &self.job.figures;
             match answer {
-                Answer::UnknownVersion | Answer::Unconfirmed => {
+                WriteResult::UnknownVersion | WriteResult::Unconfirmed => {
                     figures.count_request(Request::Retried, length);
                     self.version = Version::One;
                     body = self.body(part);
@@ -298,19 +301,19 @@ impl Sender<'_> {
                         pause = (pause * 2).min(LONGEST_PAUSE);
                     }
                 }
-                Answer::Accepted => {
+                WriteResult::Accepted => {
                     figures.count_request(Request::Delivered, length);
                     self.delivered();
                     self.limit(length).await;
                     return Ok(());
                 }
-                Answer::Refused(reason, written) => {
+                WriteResult::Refused(reason, written) => {
                     figures.count_request(Request::Refused, length);
                     self.job.waiting.state().fails = false;
                     self.limit(length).await;
                     return Err((reason, written));
                 }
-                Answer::Again(reason, demanded) => {
+                WriteResult::RetryLater(reason, demanded) => {
                     figures.count_request(Request::Retried, length);
                     self.failed(&reason);
                     sleep(demanded.unwrap_or(pause)).await;
@@ -337,8 +340,8 @@ impl Sender<'_> {
         self.is_known = true;
         self.is_refusal_logged = false;
         self.job.waiting.state().fails = false;
-        if self.works != Some(true) {
-            self.works = Some(true);
+        if self.is_working != Some(true) {
+            self.is_working = Some(true);
             let (url, version) = (&self.job.settings.url, self.version.header());
             tracing::info!(%url, version, "sending samples by remote write");
         }
@@ -347,8 +350,8 @@ impl Sender<'_> {
     /// Handles a failed request: logs the first failure until a request succeeds again, and writes
     /// the samples in memory to disk.
     fn failed(&mut self, reason: &str) {
-        let is_first = self.works != Some(false);
-        self.works = Some(false);
+        let is_first = self.is_working != Some(false);
+        self.is_working = Some(false);
         if is_first {
             let url = &self.job.settings.url;
             tracing::warn!(%url, reason, "the receiver of remote write is out of reach: samples wait");
@@ -357,15 +360,15 @@ impl Sender<'_> {
         self.job.waiting.change(&self.job.figures, |state| {
             state.fails = true;
             let lost = state.backlog.write();
-            self.job.figures.count_samples(Fate::Overflow, lost);
+            self.job.figures.count_samples(SampleFate::Overflow, lost);
         });
     }
 
     /// Counts samples as refused, and logs the first time until a request succeeds again.
     fn refused(&mut self, reason: &str, samples: u64, written: u64) {
         let figures = &self.job.figures;
-        figures.count_samples(Fate::Delivered, written.min(samples));
-        figures.count_samples(Fate::Refused, samples.saturating_sub(written));
+        figures.count_samples(SampleFate::Delivered, written.min(samples));
+        figures.count_samples(SampleFate::Refused, samples.saturating_sub(written));
         if !std::mem::replace(&mut self.is_refusal_logged, true) {
             let url = &self.job.settings.url;
             tracing::warn!(%url, reason, samples, "the receiver of remote write refuses samples");

@@ -16,7 +16,7 @@ pub enum Request {
 
 /// What became of a sample.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Fate {
+pub enum SampleFate {
     /// The receiver wrote it.
     Delivered,
     /// The receiver refused it.
@@ -32,7 +32,7 @@ pub enum Fate {
 pub struct Figures {
     is_enabled: AtomicBool,
     requests: [AtomicU64; Request::ALL.len()],
-    samples: [AtomicU64; Fate::ALL.len()],
+    samples: [AtomicU64; SampleFate::ALL.len()],
     sent_bytes: AtomicU64,
     queue_bytes: AtomicU64,
     /// Time of the oldest waiting samples in milliseconds since 1970; zero = none.
@@ -54,7 +54,7 @@ impl Request {
     }
 }
 
-impl Fate {
+impl SampleFate {
     /// All fates.
     pub const ALL: [Self; 4] = [
         Self::Delivered,
@@ -90,7 +90,7 @@ impl Figures {
 
     /// Returns the number of samples with this fate.
     #[must_use]
-    pub fn samples(&self, fate: Fate) -> u64 {
+    pub fn samples(&self, fate: SampleFate) -> u64 {
         count(self.samples.get(fate as usize))
     }
 
@@ -109,7 +109,7 @@ impl Figures {
     /// Returns the age of the oldest samples that the receiver does not have, in seconds.
     #[must_use]
     #[expect(clippy::cast_precision_loss, reason = "far below 2^52 milliseconds")]
-    pub fn behind(&self) -> f64 {
+    pub fn lag_seconds(&self) -> f64 {
         match self.oldest.load(Ordering::Relaxed) {
             0 => 0.0,
             oldest => now().saturating_sub(oldest).max(0) as f64 / 1_000.0,
@@ -128,7 +128,7 @@ impl Figures {
         self.sent_bytes.fetch_add(bytes as u64, Ordering::Relaxed);
     }
 
-    pub(super) fn count_samples(&self, fate: Fate, samples: u64) {
+    pub(super) fn count_samples(&self, fate: SampleFate, samples: u64) {
         if let Some(count) = self.samples.get(fate as usize) {
             count.fetch_add(samples, Ordering::Relaxed);
         }

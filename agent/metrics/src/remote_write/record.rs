@@ -13,12 +13,12 @@ use super::samples::{Key, MAX_SERIES, Scrape};
 
 /// Numbers of a series. A greater number is the change of a whole value, with its sign in the
 /// lowest bit.
-const SAME: u64 = 0;
-const VALUE: u64 = 1;
-const ABSENT: u64 = 2;
-const CHANGE: u64 = 3;
+const TAG_SAME: u64 = 0;
+const TAG_VALUE: u64 = 1;
+const TAG_ABSENT: u64 = 2;
+const TAG_CHANGE: u64 = 3;
 /// Whole values up to this one are exact.
-const WHOLE: f64 = 9_007_199_254_740_992.0;
+const MAX_EXACT_INTEGER: f64 = 9_007_199_254_740_992.0;
 
 /// Writes the records of a file.
 #[derive(Debug, Default)]
@@ -105,17 +105,17 @@ impl Reader {
 fn encode_value(last: Option<f64>, value: Option<f64>, record: &mut Vec<u8>) {
     let bits = |value: Option<f64>| value.map(f64::to_bits);
     match (last, value) {
-        _ if bits(last) == bits(value) => encode_varint(SAME, record),
-        (_, None) => encode_varint(ABSENT, record),
+        _ if bits(last) == bits(value) => encode_varint(TAG_SAME, record),
+        (_, None) => encode_varint(TAG_ABSENT, record),
         (last, Some(value)) => {
-            let change = whole(value).zip(whole(last.unwrap_or(0.0)));
+            let change = exact_integer(value).zip(exact_integer(last.unwrap_or(0.0)));
             match change.map(|(value, last)| value - last) {
                 Some(change) => {
                     let signed = (change << 1 ^ change >> 63).cast_unsigned();
-                    encode_varint(signed + CHANGE, record);
+                    encode_varint(signed + TAG_CHANGE, record);
                 }
                 None => {
-                    encode_varint(VALUE, record);
+                    encode_varint(TAG_VALUE, record);
                     record.extend_from_slice(&value.to_le_bytes());
                 }
             }
@@ -126,25 +126,25 @@ fn encode_value(last: Option<f64>, value: Option<f64>, record: &mut Vec<u8>) {
 #[expect(clippy::cast_precision_loss, reason = "whole values are exact")]
 fn decode_value(last: Option<f64>, record: &mut &[u8]) -> Option<Option<f64>> {
     Some(match decode_varint(record).ok()? {
-        SAME => last,
-        ABSENT => None,
-        VALUE => {
+        TAG_SAME => last,
+        TAG_ABSENT => None,
+        TAG_VALUE => {
             let (bytes, rest) = record.split_first_chunk()?;
             *record = rest;
             Some(f64::from_le_bytes(*bytes))
         }
         signed => {
-            let signed = signed - CHANGE;
+            let signed = signed - TAG_CHANGE;
             let change = (signed >> 1).cast_signed() ^ -(signed & 1).cast_signed();
-            Some(whole(last.unwrap_or(0.0))?.checked_add(change)? as f64)
+            Some(exact_integer(last.unwrap_or(0.0))?.checked_add(change)? as f64)
         }
     })
 }
 
 /// Returns a value as an integer, if that is exact.
 #[expect(clippy::cast_possible_truncation, reason = "the range is checked")]
-fn whole(value: f64) -> Option<i64> {
-    let is_whole = value.abs() < WHOLE && value.fract() == 0.0;
+fn exact_integer(value: f64) -> Option<i64> {
+    let is_whole = value.abs() < MAX_EXACT_INTEGER && value.fract() == 0.0;
     // The sign of a zero would be lost.
     (is_whole && value.to_bits() != (-0.0_f64).to_bits()).then_some(value as i64)
 }
@@ -153,15 +153,15 @@ fn whole(value: f64) -> Option<i64> {
 mod tests {
     use proptest::prelude::*;
 
-    use super::super::samples::STALE;
+    use super::super::samples::STALE_NAN;
     use super::*;
 
     fn value() -> impl Strategy<Value = f64> {
         prop_oneof![
             4 => (-1_000_i32..1_000_000).prop_map(f64::from),
             2 => any::<f64>(),
-            1 => Just(STALE),
-            1 => prop::sample::select(vec![0.0, -0.0, f64::INFINITY, WHOLE, -WHOLE, WHOLE - 1.0]),
+            1 => Just(STALE_NAN),
+            1 => prop::sample::select(vec![0.0, -0.0, f64::INFINITY, MAX_EXACT_INTEGER, -MAX_EXACT_INTEGER, MAX_EXACT_INTEGER - 1.0]),
         ]
     }
 

@@ -13,9 +13,9 @@ use crate::metric_sink::{Label, Number};
 /// The tables of the model allow fewer.
 pub(super) const MAX_SERIES: usize = 100_000;
 /// Ends each text of a key. No text contains it, because UTF-8 does not.
-pub(super) const END: u8 = 0xff;
+pub(super) const TEXT_END: u8 = 0xff;
 /// Value of a series that ended (`StaleNaN` of Prometheus).
-pub(super) const STALE: f64 = f64::from_bits(0x7ff0_0000_0000_0002);
+pub(super) const STALE_NAN: f64 = f64::from_bits(0x7ff0_0000_0000_0002);
 
 /// A series: the type of its metric as one byte, its name, and names and values of its labels.
 /// [`END`] ends each text.
@@ -55,14 +55,14 @@ impl Samples {
         self.add(1.0);
     }
 
-    /// Ends a collection. Returns its samples, with [`STALE`] for each series that ended, and the
-    /// number of samples that did not fit.
+    /// Ends a collection. Returns its samples, with [`STALE_NAN`] for each series that ended, and
+    /// the number of samples that did not fit.
     pub(super) fn end(&mut self, at: i64) -> (Scrape, u64) {
         let mut samples = std::mem::take(&mut self.collected);
         self.known.retain(|key, last| {
             let continues = *last == self.collection;
             if !continues {
-                samples.push((Arc::clone(key), STALE));
+                samples.push((Arc::clone(key), STALE_NAN));
             }
             continues
         });
@@ -71,7 +71,11 @@ impl Samples {
 
     /// Returns the end of all series.
     pub(super) fn end_all(&mut self, at: i64) -> Scrape {
-        let samples = self.known.drain().map(|(key, _)| (key, STALE)).collect();
+        let samples = self
+            .known
+            .drain()
+            .map(|(key, _)| (key, STALE_NAN))
+            .collect();
         Scrape { at, samples }
     }
 
@@ -142,12 +146,12 @@ impl Samples {
 
     fn extend(&mut self, text: &str) {
         self.key.extend_from_slice(text.as_bytes());
-        self.key.push(END);
+        self.key.push(TEXT_END);
     }
 
     fn extend_by_text(&mut self) {
         self.key.extend_from_slice(self.text.as_bytes());
-        self.key.push(END);
+        self.key.push(TEXT_END);
     }
 
     fn add(&mut self, value: f64) {
@@ -179,8 +183,9 @@ pub(super) fn parts(key: &[u8]) -> (u8, impl Iterator<Item = &str>) {
     let (kind, texts) = key
         .split_first()
         .map_or((0, key), |(kind, rest)| (*kind, rest));
-    let texts = texts.split_inclusive(|byte| *byte == END);
-    let texts = texts.map(|text| std::str::from_utf8(text.strip_suffix(&[END]).unwrap_or(text)));
+    let texts = texts.split_inclusive(|byte| *byte == TEXT_END);
+    let texts =
+        texts.map(|text| std::str::from_utf8(text.strip_suffix(&[TEXT_END]).unwrap_or(text)));
     (kind, texts.map(Result::unwrap_or_default))
 }
 
@@ -235,7 +240,7 @@ mod tests {
         let second = texts(&collect(None).0);
         assert_eq!(second[..2], always);
         assert_eq!(second[2].0, requests);
-        assert_eq!(second[2].1.to_bits(), STALE.to_bits());
+        assert_eq!(second[2].1.to_bits(), STALE_NAN.to_bits());
         assert_eq!(texts(&collect(None).0), always);
         assert!(
             texts(&samples.end_all(9))

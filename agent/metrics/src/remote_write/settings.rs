@@ -15,7 +15,7 @@ use crate::otlp::{Host, ReadText};
 /// Maximum size of a file with a token, certificates or a key, in bytes.
 const FILE_BYTES: u64 = 1 << 20;
 /// Value of the label `job`, as in the scrape configurations.
-const JOB: &str = "ros2probe";
+const JOB_LABEL: &str = "ros2probe";
 
 /// Delivery to a receiver of Prometheus remote write.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -150,7 +150,7 @@ impl Settings {
         let instance = file.instance.clone().or_else(|| host.name.clone());
         let mut labels = file.labels.clone();
         for (name, value) in [
-            ("job", JOB.to_owned()),
+            ("job", JOB_LABEL.to_owned()),
             ("instance", instance.unwrap_or_default()),
         ] {
             labels.entry(name.to_owned()).or_insert(value);

@@ -1,7 +1,7 @@
 //! Offsets between the clocks of hosts, with bounds, from traffic alone.
 //!
-//! A message that a peer stamps at `s` arrives at `a`. The peer's clock was at least `s` then, so it
-//! is ahead of this host's clock by at least `s - a`. Most messages are late, so the greatest of
+//! A message that a peer stamps at `s` arrives at `a`. The peer's clock was at least `s` then, so
+//! it is ahead of this host's clock by at least `s - a`. Most messages are late, so the greatest of
 //! these values counts. The other bound needs a message of this host that reached the peer:
 //!
 //! - A reply follows its request. A request that left at `d` and a reply stamped `s` show that the
@@ -34,15 +34,15 @@ pub use bounds::{Range, Source};
 /// Name of the agent's host in answers if no participant announces it.
 pub const THIS_HOST: &str = "localhost";
 /// Latest messages of one writer whose acknowledgement gives a round trip.
-const SENT: usize = 16;
+const MAX_SENT_PER_WRITER: usize = 16;
 /// An ACKNACK answers no HEARTBEAT that left longer before it.
-const ANSWER: Duration = Duration::from_millis(500);
+const MAX_RESPONSE_DELAY: Duration = Duration::from_millis(500);
 /// Latest messages of writers that no peer has acknowledged so far.
-const OTHERS: usize = 32;
+const MAX_UNACKNOWLEDGED_WRITERS: usize = 32;
 /// Nanoseconds between two clocks, beyond the uncertainty: from the first number on the offset is a
 /// finding, and below the second it is none any longer.
-const APART: i64 = 10_000_000;
-const TOGETHER: i64 = 5_000_000;
+const MIN_OFFSET_OF_FINDING: i64 = 10_000_000;
+const MAX_OFFSET_OF_RESOLUTION: i64 = 5_000_000;
 
 /// The clocks of all hosts whose messages arrive here.
 #[derive(Debug, Default)]
@@ -52,7 +52,7 @@ pub struct Clocks {
     /// Writers of this host with readers on a peer that acknowledge.
     writers: Bounded<Counted<ClockWriters>, HashMap<Guid, Sent>>,
     /// The latest messages of all other writers.
-    others: Others,
+    unacknowledged: UnacknowledgedMessages,
     /// Name that participants of this host announce.
     name: Option<Arc<str>>,
     /// Whether latencies of a peer's messages are corrected.
@@ -65,7 +65,7 @@ struct Peer {
     name: Option<Arc<str>>,
     evidence: Evidence,
     /// The finding, as it began.
-    apart: Option<Range>,
+    offset_finding: Option<Range>,
     /// Nanoseconds that are added to latencies of its messages.
     correction: i64,
 }
@@ -74,8 +74,8 @@ struct Peer {
 #[derive(Debug, Default)]
 struct Sent {
     newest: SequenceNumber,
-    times: [(SequenceNumber, ModelTime); SENT],
-    /// HEARTBEATs that follow each other by less than `ANSWER`.
+    times: [(SequenceNumber, ModelTime); MAX_SENT_PER_WRITER],
+    /// HEARTBEATs that follow each other by less than `MAX_RESPONSE_DELAY`.
     announced: Option<Announced>,
     /// The greatest number that a reader acknowledged.
     acknowledged: SequenceNumber,
@@ -94,8 +94,8 @@ struct Announced {
 
 /// The latest messages of writers that no peer has acknowledged, and the times at which they left.
 #[derive(Debug, Default)]
-struct Others {
-    messages: [(Guid, SequenceNumber, ModelTime); OTHERS],
+struct UnacknowledgedMessages {
+    messages: [(Guid, SequenceNumber, ModelTime); MAX_UNACKNOWLEDGED_WRITERS],
     /// Place of the oldest message.
     oldest: usize,
 }
@@ -165,18 +165,18 @@ impl Clocks {
     }
 
     /// Records that a peer stamped a reply to a request that left this host at `sent`.
-    pub fn replied(&mut self, peer: IpAddr, stamp: Timestamp, sent: ModelTime, now: ModelTime) {
+    pub fn note_reply(&mut self, peer: IpAddr, stamp: Timestamp, sent: ModelTime, now: ModelTime) {
         if let Some(peer) = self.peers.get_mut(&peer) {
             peer.evidence.replied(ahead(stamp, sent), now);
         }
     }
 
     /// Records that a message of this host left for the first time or again.
-    pub fn left(&mut self, writer: Guid, number: SequenceNumber, at: ModelTime) {
+    pub fn note_sent(&mut self, writer: Guid, number: SequenceNumber, at: ModelTime) {
         match self.writers.get_mut(&writer) {
             Some(sent) => sent.put(number, at),
             // A writer may request one acknowledgement only, of its first messages.
-            None => self.others.put((writer, number, at)),
+            None => self.unacknowledged.put((writer, number, at)),
         }
     }
 
@@ -199,7 +199,7 @@ impl Clocks {
             Some(sent) => sent.requested(number).max(sent.time(number)),
             None => {
                 self.writers.get_or_insert_with(writer, Sent::default);
-                self.others.time(writer, number)
+                self.unacknowledged.time(writer, number)
             }
         };
         if let Some(left) = left
@@ -235,12 +235,12 @@ impl Clocks {
         for peer in self.peers.values_mut() {
             let range = peer.evidence.range(now, clock);
             let least = range.map_or(0, |range| range.least_distance());
-            let is_apart = match peer.apart {
-                Some(_) => least > TOGETHER,
-                None => least > APART,
+            let is_apart = match peer.offset_finding {
+                Some(_) => least > MAX_OFFSET_OF_RESOLUTION,
+                None => least > MIN_OFFSET_OF_FINDING,
             };
-            if is_apart != peer.apart.is_some() {
-                peer.apart = range.filter(|_| is_apart);
+            if is_apart != peer.offset_finding.is_some() {
+                peer.offset_finding = range.filter(|_| is_apart);
                 changes += 1;
             }
         }
@@ -274,7 +274,7 @@ impl Clocks {
     pub fn findings(&self) -> impl Iterator<Item = Diagnosis> {
         let labels = self.labels();
         self.peers.iter().filter_map(move |(address, peer)| {
-            let range = peer.apart?;
+            let range = peer.offset_finding?;
             Some(Diagnosis::ClocksApart {
                 peer: labels.get(address).cloned()?,
                 offset: range.middle(),
@@ -363,7 +363,9 @@ impl Sent {
     }
 
     fn announce(&mut self, number: SequenceNumber, at: ModelTime) {
-        let before = self.announced.filter(|before| at - before.last < ANSWER);
+        let before = self
+            .announced
+            .filter(|before| at - before.last < MAX_RESPONSE_DELAY);
         self.announced = Some(Announced {
             first: before.map_or(at, |before| before.first),
             last: at,
@@ -391,12 +393,12 @@ impl Sent {
     }
 }
 
-impl Others {
+impl UnacknowledgedMessages {
     fn put(&mut self, message: (Guid, SequenceNumber, ModelTime)) {
         if let Some(oldest) = self.messages.get_mut(self.oldest) {
             *oldest = message;
         }
-        self.oldest = (self.oldest + 1) % OTHERS;
+        self.oldest = (self.oldest + 1) % MAX_UNACKNOWLEDGED_WRITERS;
     }
 
     /// Returns the first time at which a message left: an acknowledgement may be for the first
@@ -421,7 +423,7 @@ pub fn seconds(nanoseconds: i64) -> f64 {
 
 /// Returns the slot of a number.
 fn slot(number: SequenceNumber) -> usize {
-    usize::try_from(number.0 % SENT as u64).unwrap_or(0)
+    usize::try_from(number.0 % MAX_SENT_PER_WRITER as u64).unwrap_or(0)
 }
 
 /// Returns by how many nanoseconds a stamp is ahead of a time.

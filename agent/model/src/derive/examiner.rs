@@ -30,12 +30,12 @@ use near::LonelyTopics;
 /// Time for which an endpoint may have no counterpart, because nodes start one after another.
 const MATCH_TIMEOUT: Duration = Duration::from_secs(5);
 /// Maximum number of findings kept of each kind.
-const PER_KIND: usize = 256;
+const MAX_FINDINGS_PER_KIND: usize = 256;
 /// Maximum number of series for incompatible pairs.
 const MAX_QOS_PAIRS: usize = 1024;
 /// Maximum number of steps per examination, and per topic. A step takes about ten nanoseconds.
-const STEPS: usize = 500_000;
-const STEPS_PER_TOPIC: usize = 50_000;
+const MAX_STEPS: usize = 500_000;
+const MAX_STEPS_PER_TOPIC: usize = 50_000;
 
 /// Examines the graph after each change.
 #[derive(Debug, Default)]
@@ -46,7 +46,7 @@ pub struct Examiner {
     /// Time at which the first unmatched endpoint becomes a finding.
     due: Option<ModelTime>,
     /// Time at which each unmatched endpoint was first found to be unmatched.
-    alone: HashMap<Guid, ModelTime>,
+    unmatched_since: HashMap<Guid, ModelTime>,
     current: Arc<Diagnoses>,
     /// Time at which each finding appeared.
     since: Arc<Vec<ModelTime>>,
@@ -63,7 +63,7 @@ struct Findings {
     unexamined: u64,
     /// Remaining steps, in total and for this topic.
     steps: usize,
-    steps_here: usize,
+    steps_of_topic: usize,
 }
 
 impl Examiner {
@@ -82,7 +82,7 @@ impl Examiner {
     /// Returns the number of findings, their cap, and how many were omitted so far.
     #[must_use]
     pub fn size(&self) -> (usize, usize, u64) {
-        let limit = PER_KIND * Diagnosis::KINDS.len();
+        let limit = MAX_FINDINGS_PER_KIND * Diagnosis::KINDS.len();
         (self.current.list.len(), limit, self.left_out)
     }
 
@@ -124,7 +124,7 @@ impl Examiner {
         for (_, topic) in topics.iter() {
             for unmatched in endpoints.examine(topic, &mut findings) {
                 let UnmatchedEndpoint { guid, diagnosis } = unmatched;
-                let since = self.alone.get(&guid).copied().unwrap_or(now);
+                let since = self.unmatched_since.get(&guid).copied().unwrap_or(now);
                 alone.insert(guid, since);
                 let end = since + MATCH_TIMEOUT;
                 if end <= now {
@@ -156,7 +156,7 @@ impl Examiner {
         for finding in chains.findings() {
             findings.add(finding.clone());
         }
-        (self.alone, self.due) = (alone, due);
+        (self.unmatched_since, self.due) = (alone, due);
         let found = findings.finish();
         let more = found.left_out.saturating_sub(self.current.left_out);
         self.left_out += more;
@@ -195,8 +195,8 @@ impl Findings {
             qos_pairs: Vec::new(),
             left_out: 0,
             unexamined: 0,
-            steps: STEPS,
-            steps_here: 0,
+            steps: MAX_STEPS,
+            steps_of_topic: 0,
         }
     }
 
@@ -205,7 +205,7 @@ impl Findings {
         let kinds = Diagnosis::KINDS.iter().zip(&mut self.counts);
         let mut own = kinds.filter(|(kind, _)| **kind == diagnosis.kind());
         match own.next() {
-            Some((_, count)) if *count < PER_KIND => {
+            Some((_, count)) if *count < MAX_FINDINGS_PER_KIND => {
                 *count += 1;
                 self.list.push(diagnosis);
             }
@@ -214,21 +214,21 @@ impl Findings {
     }
 
     /// Counts findings that are omitted.
-    const fn leave_out(&mut self, count: u64) {
+    const fn note_omitted(&mut self, count: u64) {
         self.left_out += count;
     }
 
     /// Starts the step budget of the next topic.
-    const fn turn(&mut self) {
-        self.steps_here = STEPS_PER_TOPIC;
+    const fn start_topic(&mut self) {
+        self.steps_of_topic = MAX_STEPS_PER_TOPIC;
     }
 
     /// Spends steps; returns false if the budget is exhausted.
-    const fn spend(&mut self, steps: usize) -> bool {
-        let may = steps <= self.steps && steps <= self.steps_here;
+    const fn spend_steps(&mut self, steps: usize) -> bool {
+        let may = steps <= self.steps && steps <= self.steps_of_topic;
         if may {
             self.steps -= steps;
-            self.steps_here -= steps;
+            self.steps_of_topic -= steps;
         }
         may
     }
@@ -249,7 +249,7 @@ impl Findings {
 
 /// Returns the domains that are known only in part: some ROS participant has no announced endpoint
 /// there, although every ROS participant has endpoints.
-fn half_known(discovery: &Discovery) -> BTreeSet<DomainId> {
+fn partly_known_domains(discovery: &Discovery) -> BTreeSet<DomainId> {
     let participants = discovery.participants().values();
     let silent = participants.filter(|participant| {
         participant.proxy.enclave.is_some() && participant.endpoints.is_empty()

@@ -51,12 +51,12 @@ const MESSAGE_BYTES: usize = 64 << 10;
 /// Maximum size of all unfinished messages, in bytes.
 const ASSEMBLY_BYTES: usize = 1 << 20;
 /// Bytes of one writer that may be captured in a burst, and per second.
-const WRITER: Allowance = Allowance::new(1 << 20, 64 << 10);
+const WRITER_ALLOWANCE: Allowance = Allowance::new(1 << 20, 64 << 10);
 /// Bytes of all writers that may be captured in a burst, and per second.
-const ALL_WRITERS: Allowance = Allowance::new(8 << 20, 512 << 10);
+const COMMON_ALLOWANCE: Allowance = Allowance::new(8 << 20, 512 << 10);
 /// The same of transforms: a message each of thirty joints, 100 times a second, is 300 KB/s.
-const BROADCASTER: Allowance = Allowance::new(2 << 20, 512 << 10);
-const ALL_BROADCASTERS: Allowance = Allowance::new(8 << 20, 2 << 20);
+const BROADCASTER_ALLOWANCE: Allowance = Allowance::new(2 << 20, 512 << 10);
+const COMMON_BROADCASTER_ALLOWANCE: Allowance = Allowance::new(8 << 20, 2 << 20);
 /// A paused writer is captured again once it is allowed this many bytes.
 const RESUME_BYTES: u64 = 256 << 10;
 /// Minimum time by which a message with a lower number is written later, after a restart of its
@@ -159,7 +159,7 @@ struct RobotWriter {
 
 /// What a sample of a followed writer changed.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Heard {
+pub enum ReadOutcome {
     /// Nothing, or some of its bytes are still missing.
     Nothing,
     /// The writer is paused, or needs no further messages: its verdict has changed.
@@ -290,8 +290,8 @@ impl Default for Robot {
             writers: Bounded::default(),
             assembly: Assembly::new(ASSEMBLY_BYTES),
             allowances: Allowances {
-                transforms: CommonAllowance::new(ALL_BROADCASTERS, RESUME_BYTES),
-                others: CommonAllowance::new(ALL_WRITERS, RESUME_BYTES),
+                transforms: CommonAllowance::new(COMMON_BROADCASTER_ALLOWANCE, RESUME_BYTES),
+                others: CommonAllowance::new(COMMON_ALLOWANCE, RESUME_BYTES),
             },
             logs: Logs::default(),
             diagnostics: Diagnostics::default(),
@@ -354,8 +354,8 @@ impl Robot {
             topic: topic.clone(),
             standard,
             allowance: WriterAllowance::new(match standard {
-                Standard::Transforms => BROADCASTER,
-                _ => WRITER,
+                Standard::Transforms => BROADCASTER_ALLOWANCE,
+                _ => WRITER_ALLOWANCE,
             }),
             read: ReadNumbers::default(),
         };
@@ -399,38 +399,38 @@ impl Robot {
 
     /// Reads a DATA or DATA_FRAG of a followed writer. `node` is the node that has the writer.
     /// `vendor` is its implementation. `call` identifies the call of a request or reply.
-    pub fn hear(
+    pub fn read_sample(
         &mut self,
         sample: &Sample,
         payload: &[u8],
         (node, vendor): (Option<&NodeName>, VendorId),
         call: impl FnOnce(Half) -> Option<CallId>,
         events: &mut Events,
-    ) -> Heard {
+    ) -> ReadOutcome {
         let (writer, now) = (sample.head.writer, sample.head.at);
         if sample.is_message() && sample.is_start() && self.frames.waits(writer) {
             self.frames.read(writer, payload);
-            return Heard::Paused;
+            return ReadOutcome::Paused;
         }
         let Some(known) = self.writers.get_mut(&writer) else {
-            return Heard::Nothing;
+            return ReadOutcome::Nothing;
         };
         // Until the kernel knows of a pause, it captures more.
         let allowance = self.allowances.of(known.standard);
         let is_allowed = allowance.spend(&mut known.allowance, payload.len(), now);
         if known.allowance.is_paused() || !sample.is_message() {
-            return Heard::Nothing;
+            return ReadOutcome::Nothing;
         }
         let bytes = usize::try_from(sample.size()).unwrap_or(usize::MAX);
         if !is_allowed || bytes > MESSAGE_BYTES {
             allowance.pause(&mut known.allowance);
             self.assembly.release(writer);
-            return Heard::Paused;
+            return ReadOutcome::Paused;
         }
         let number = sample.sequence_number;
         let source = sample.source_timestamp.timestamp();
         if known.read.has(number, source) {
-            return Heard::Nothing;
+            return ReadOutcome::Nothing;
         }
         let standard = known.standard;
         let assembled;
@@ -439,10 +439,10 @@ impl Robot {
             false => {
                 self.assembly.put(sample, payload, 0);
                 if !self.assembly.is_whole(writer, number) {
-                    return Heard::Nothing;
+                    return ReadOutcome::Nothing;
                 }
                 let Some(bytes) = self.assembly.take(writer, number) else {
-                    return Heard::Nothing;
+                    return ReadOutcome::Nothing;
                 };
                 assembled = bytes;
                 &assembled
@@ -472,7 +472,7 @@ impl Robot {
             }
             Standard::TransitionEvent => match Transition::parse(payload) {
                 Ok(transition) => match self.lifecycle.transit(&origin, transition) {
-                    Some(node) => return Heard::Transition(transition.from, node),
+                    Some(node) => return ReadOutcome::Transition(transition.from, node),
                     None => Ok(()),
                 },
                 Err(error) => Err(error),
@@ -488,7 +488,7 @@ impl Robot {
                     .and_then(|parameters| self.parameters.request(&origin, parameters))
             }
             Standard::GetParameters => RequestedNames::of_request(payload, header(vendor))
-                .and_then(|names| self.parameters.ask(call(Half::Requests), names)),
+                .and_then(|names| self.parameters.add_get_request(call(Half::Requests), names)),
             Standard::ParameterValues => {
                 RepliedValues::of_reply(payload, header(vendor)).and_then(|values| {
                     self.parameters
@@ -497,8 +497,8 @@ impl Robot {
             }
         };
         match decoded {
-            Ok(()) => Heard::Decoded,
-            Err(error) => Heard::Malformed(standard, error),
+            Ok(()) => ReadOutcome::Decoded,
+            Err(error) => ReadOutcome::Malformed(standard, error),
         }
     }
 

@@ -36,12 +36,12 @@ use crate::facts::observation::{Head, Sample};
 use crate::facts::tables::{CallIdentities, OpenCalls, ServiceFigures, ServiceWriters};
 use crate::facts::topic_kind::TopicKind;
 use action::Action;
-use service::{CallId, Position, Service, Sighting};
+use service::{CallId, Capture, Position, Service};
 
 /// Maximum bytes per second of one writer. A writer that exceeds it is not captured for a while.
 const MAX_BYTES_PER_SECOND: usize = 4 << 20;
 /// Time for which a writer above the maximum is not captured.
-const SUSPENDED: Duration = Duration::from_secs(10);
+const SUSPENSION_TIME: Duration = Duration::from_secs(10);
 
 /// End of the name of a node's service for descriptions of types (REP-2016).
 const TYPE_DESCRIPTION: &str = "/get_type_description";
@@ -228,7 +228,7 @@ impl Services {
         if self.charge(guid, payload.len(), at) {
             return true;
         }
-        let identity = Identity::of(call, payload.get(ENCAPSULATION..).unwrap_or_default());
+        let identity = Identity::of(call, payload.get(ENCAPSULATION_BYTES..).unwrap_or_default());
         self.identities.put((guid, number), identity);
         false
     }
@@ -241,7 +241,7 @@ impl Services {
         if !writer.is_over_budget(bytes, at) {
             return false;
         }
-        let until = at + SUSPENDED;
+        let until = at + SUSPENSION_TIME;
         writer.suspended = Some(until);
         let key = writer.service.key.clone();
         self.suspend(&key, until, at);
@@ -265,7 +265,7 @@ impl Services {
         let identity = self.identities.known.get(&message).copied()?;
         let service = Arc::clone(&writer.service);
         let position = position(sample);
-        let mut sighting = Sighting {
+        let mut sighting = Capture {
             at: head.at,
             socket: head.socket,
             position,
@@ -399,9 +399,9 @@ impl Services {
         name: &ServiceName,
         writer: Guid,
         identity: Identity,
-        sighting: Sighting,
+        sighting: Capture,
     ) {
-        if !self.services.contains_key(&name.key) && !self.has_place(sighting.at) {
+        if !self.services.contains_key(&name.key) && !self.make_room(sighting.at) {
             return;
         }
         let key = name.key.clone();
@@ -415,7 +415,7 @@ impl Services {
         self.open.add(1);
         if self.open.is_exceeded() {
             self.open.refuse();
-            self.open.sub(service.forget_one().into());
+            self.open.sub(service.drop_oldest_call().into());
             self.revision += 1;
         }
     }
@@ -426,7 +426,7 @@ impl Services {
         writer: Guid,
         identity: Identity,
         sample: &Sample,
-        sighting: Sighting,
+        sighting: Capture,
     ) -> Option<(ModelTime, Guid)> {
         let service = self.services.get_mut(&name.key)?;
         let answered = service.reply(identity.call, writer, sample, sighting)?;
@@ -460,7 +460,7 @@ impl Services {
 
     /// Returns whether one more service can be added. If necessary, the service without open calls
     /// whose last request is oldest is dropped.
-    fn has_place(&mut self, at: ModelTime) -> bool {
+    fn make_room(&mut self, at: ModelTime) -> bool {
         if !self.services.is_full() {
             return true;
         }
@@ -476,7 +476,7 @@ impl Services {
     /// Drops the open calls of a service, because one of its writers is no longer captured.
     fn suspend(&mut self, key: &Key, until: ModelTime, at: ModelTime) {
         self.open.refuse();
-        if !self.services.contains_key(key) && !self.has_place(at) {
+        if !self.services.contains_key(key) && !self.make_room(at) {
             return;
         }
         let key = key.clone();
@@ -550,7 +550,7 @@ fn identity(
             },
             _ => return Ok(None),
         };
-        (call, ENCAPSULATION)
+        (call, ENCAPSULATION_BYTES)
     };
     let body = if sample.is_start() {
         found.payload.get(body..).unwrap_or_default()
@@ -580,7 +580,7 @@ pub fn call(half: Half, found: &Found<'_>, sample: &Sample, vendor: VendorId) ->
 }
 
 /// Bytes of the encapsulation header (RTPS 2.5, 10.2).
-const ENCAPSULATION: usize = 4;
+const ENCAPSULATION_BYTES: usize = 4;
 
 /// Returns where the sample was seen.
 fn position(sample: &Sample) -> Position {

@@ -12,22 +12,22 @@ use ros2probe_wire::{DomainId, Guid, SequenceNumber, Timestamp};
 
 use crate::facts::bounded::{Bounded, Counted, TableFacts};
 use crate::facts::diagnosis::{Diagnosis, StampFault, TopicKey};
-use crate::facts::header::PLAUSIBLE;
+use crate::facts::header::MAX_PLAUSIBLE_OFFSET;
 use crate::facts::model_time::ModelTime;
 use crate::facts::tables::StampWriters;
 
 /// Nanoseconds by which a stamp may be later than the publication of its message.
-const FUTURE: i64 = 20_000_000;
+const MAX_LEAD_NANOSECONDS: i64 = 20_000_000;
 /// Number of messages in a row that begin or end a fault.
-const IN_A_ROW: u8 = 3;
+const MIN_STREAK: u8 = 3;
 /// Time for which a stamp that went back is a fault.
-const REMEMBERED: Duration = Duration::from_secs(60);
+const FAULT_LIFETIME: Duration = Duration::from_secs(60);
 /// Time over which the least age of a stamp is taken.
 const WINDOW: Duration = Duration::from_secs(30);
 /// Number of windows that must drift in one direction.
-const WINDOWS: usize = 4;
+const DRIFTING_WINDOWS: usize = 4;
 /// Least drift from one window to the next, in nanoseconds: 33 ppm.
-const DRIFT: i64 = 1_000_000;
+const MIN_DRIFT_NANOSECONDS: i64 = 1_000_000;
 
 /// The stamps of all publishers whose messages are measured and begin with a header.
 #[derive(Debug, Default)]
@@ -158,13 +158,13 @@ impl StampWriter {
         let seconds = u64::try_from(seconds).unwrap_or(0);
         let stamp = Timestamp(seconds * SECOND + u64::from(nanoseconds));
         let age = published.nanoseconds_since(stamp);
-        let is_far = stamp.distance(published) > PLAUSIBLE;
+        let is_far = stamp.distance(published) > MAX_PLAUSIBLE_OFFSET;
         self.other_clock.note(is_far, age);
         let last = self.last.replace((stamp, published));
         if is_far {
             return;
         }
-        self.future.note(age < -FUTURE, -age);
+        self.future.note(age < -MAX_LEAD_NANOSECONDS, -age);
         if let Some((last_stamp, last_published)) = last
             && stamp < last_stamp
             && published > last_published
@@ -185,7 +185,7 @@ impl StampWriter {
             let is_fault = !simulated.contains(&self.topic.domain_id);
             return is_fault.then_some((StampFault::OtherClock, age));
         }
-        let back = self.back.filter(|(at, _)| now - *at < REMEMBERED);
+        let back = self.back.filter(|(at, _)| now - *at < FAULT_LIFETIME);
         let back = back.map(|(_, by)| (StampFault::WentBack, by));
         let future = self.future.value.map(|by| (StampFault::Future, by));
         back.or(future).or(self.drift())
@@ -200,7 +200,7 @@ impl StampWriter {
             Some(least) => self.least.push_back(least),
             None => self.least.clear(),
         }
-        if self.least.len() > WINDOWS + 1 {
+        if self.least.len() > DRIFTING_WINDOWS + 1 {
             self.least.pop_front();
         }
         self.window.0 = now;
@@ -209,13 +209,13 @@ impl StampWriter {
     /// Returns the drift of the least age from the first to the last window, if it goes in one
     /// direction.
     fn drift(&self) -> Option<(StampFault, i64)> {
-        if self.least.len() <= WINDOWS {
+        if self.least.len() <= DRIFTING_WINDOWS {
             return None;
         }
         let steps = self.least.iter().zip(self.least.iter().skip(1));
         let steps: Vec<_> = steps.map(|(before, after)| after - before).collect();
-        let is_steady =
-            steps.iter().all(|step| *step >= DRIFT) || steps.iter().all(|step| *step <= -DRIFT);
+        let is_steady = steps.iter().all(|step| *step >= MIN_DRIFT_NANOSECONDS)
+            || steps.iter().all(|step| *step <= -MIN_DRIFT_NANOSECONDS);
         let sum: i64 = steps.iter().sum();
         is_steady.then_some((StampFault::Drifting, sum))
     }
@@ -228,7 +228,7 @@ impl Streak {
             return;
         }
         self.count += 1;
-        if self.count >= IN_A_ROW {
+        if self.count >= MIN_STREAK {
             self.count = 0;
             self.value = holds.then_some(value);
         }

@@ -138,11 +138,11 @@ struct WriterTrace {
     /// Whether it sends from this host. The kernel reports the local copies of a multicast before
     /// its departure, so the first message arrives before this is known.
     is_local: bool,
-    under_way: Bounded<MessagesUnderWay, VecDeque<Message>>,
+    in_transit: Bounded<MessagesUnderWay, VecDeque<Message>>,
     /// Spans of arrivals, until it is certain that they were not sent from this host.
     arrived: Bounded<OpenMessages, VecDeque<Span<ModelTime>>>,
     waiting: Bounded<OpenMessages, VecDeque<Unacknowledged>>,
-    done: Bounded<FinishedMessages, VecDeque<SequenceNumber>>,
+    finished: Bounded<FinishedMessages, VecDeque<SequenceNumber>>,
 }
 
 /// A message that was sent and that some readers have not acknowledged.
@@ -318,10 +318,10 @@ impl WriterTrace {
             share,
             samples: Samples::default(),
             is_local: false,
-            under_way: Bounded::default(),
+            in_transit: Bounded::default(),
             arrived: Bounded::default(),
             waiting: Bounded::default(),
-            done: Bounded::default(),
+            finished: Bounded::default(),
         }
     }
 
@@ -336,11 +336,11 @@ impl WriterTrace {
         }
         // Copies that arrive do not belong to the departure.
         let is_copy = place == Place::LocalCopy || self.is_local && place == Place::Arrival;
-        if is_copy || self.done.contains(&number) {
+        if is_copy || self.finished.contains(&number) {
             return;
         }
         let known = |message: &Message| message.sequence_number == number;
-        let index = match self.under_way.iter().position(known) {
+        let index = match self.in_transit.iter().position(known) {
             // The wire shows the fragments of this message.
             Some(_) if sample.head.is_in_shared_memory() => return,
             Some(index) => index,
@@ -356,18 +356,18 @@ impl WriterTrace {
                     Progress::Partial | Progress::Duplicate => return,
                     Progress::Complete(facts) => (facts.began, facts.source),
                     Progress::Rejected | Progress::TooMany => {
-                        self.under_way.remove(index);
-                        shared.give_up();
+                        self.in_transit.remove(index);
+                        shared.drop_oldest();
                         return;
                     }
                 }
             }
         };
-        let Some(mut message) = self.under_way.remove(index) else {
+        let Some(mut message) = self.in_transit.remove(index) else {
             return;
         };
         message.source = source;
-        self.done.push_back(number);
+        self.finished.push_back(number);
         self.whole(message, begin, at, shared);
     }
 
@@ -378,7 +378,7 @@ impl WriterTrace {
             self.arrived
                 .pop_front()
                 .map_or_else(|| drop(self.waiting.pop_front()), drop);
-            shared.give_up();
+            shared.drop_oldest();
         }
         let mut span = Span {
             stage: SpanStage::Receive,
@@ -418,31 +418,31 @@ impl WriterTrace {
     /// Drops the spans of arrivals, because the writer sends from this host.
     fn forget_arrivals(&mut self, shared: &mut Shared) {
         self.is_local = true;
-        let open = self.under_way.len() + self.arrived.len();
+        let open = self.in_transit.len() + self.arrived.len();
         shared.open.sub(open);
-        self.under_way.clear();
+        self.in_transit.clear();
         self.arrived.clear();
-        self.done.clear();
+        self.finished.clear();
         self.samples.clear(&mut shared.budget);
     }
 
     /// Adds a message, dropping another if necessary, and returns its index.
     fn begin(&mut self, message: Message, shared: &mut Shared) -> Option<usize> {
-        if self.under_way.is_full() {
-            self.under_way.pop_front();
-            self.under_way.refuse();
-            shared.give_up();
+        if self.in_transit.is_full() {
+            self.in_transit.pop_front();
+            self.in_transit.refuse();
+            shared.drop_oldest();
         }
         if shared.open.is_full() {
             if self.waiting.pop_front().is_none() {
                 shared.open.refuse();
                 return None;
             }
-            shared.give_up();
+            shared.drop_oldest();
         }
         shared.open.add(1);
-        self.under_way.push_back(message);
-        self.under_way.len().checked_sub(1)
+        self.in_transit.push_back(message);
+        self.in_transit.len().checked_sub(1)
     }
 
     fn message(&self, sample: &Sample, trace_id: u128) -> Message {
@@ -481,7 +481,7 @@ impl WriterTrace {
 
     fn close(mut self, shared: &mut Shared) {
         self.release(ModelTime::MAX, shared);
-        let open = self.under_way.len() + self.waiting.len();
+        let open = self.in_transit.len() + self.waiting.len();
         shared.open.sub(open);
         self.samples.clear(&mut shared.budget);
     }
@@ -492,7 +492,7 @@ impl Place {
     fn of(head: &Head, is_local: bool) -> Option<Self> {
         let is_stream = matches!(head.path, Path::Stream { .. });
         let by_router = is_stream && head.is_at_socket() && !is_local;
-        match (head.leaves(), is_local) {
+        match (head.is_outgoing(), is_local) {
             (true, _) if by_router => None,
             (true, _) => Some(Self::Departure),
             (false, true) => Some(Self::LocalCopy),
@@ -506,7 +506,7 @@ impl Shared {
         self.lost += u64::from(self.finished.push(span).is_some());
     }
 
-    fn give_up(&mut self) {
+    fn drop_oldest(&mut self) {
         self.open.sub(1);
         self.open.refuse();
     }

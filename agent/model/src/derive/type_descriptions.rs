@@ -13,7 +13,7 @@ use crate::facts::tables::WaitingDescriptions;
 /// Maximum size of a response or reply, in bytes.
 const MAX_RESPONSE: usize = 256 << 10;
 /// Bytes of the encapsulation header (RTPS 2.5, 10.2).
-const ENCAPSULATION: usize = 4;
+const ENCAPSULATION_BYTES: usize = 4;
 
 /// What a node sent about its types.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -51,9 +51,9 @@ impl TypeDescriptions {
         // rmw_cyclonedds writes the identity of the request before the response.
         let body = match vendor {
             Some(VendorId::CYCLONE) => RequestHeader::END,
-            _ => ENCAPSULATION,
+            _ => ENCAPSULATION_BYTES,
         };
-        let parts = (payload.get(..ENCAPSULATION), payload.get(body..));
+        let parts = (payload.get(..ENCAPSULATION_BYTES), payload.get(body..));
         if let (Some(encapsulation), Some(body)) = parts
             && payload.len() <= MAX_RESPONSE
         {

@@ -243,7 +243,7 @@ impl<D: Declared> Sum<D> {
     }
 
     /// Returns the amount that can be added.
-    pub fn room(&self) -> usize {
+    pub fn remaining(&self) -> usize {
         self.declared.cap().saturating_sub(self.used)
     }
 

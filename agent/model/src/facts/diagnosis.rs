@@ -20,7 +20,7 @@ use ros2probe_wire::{DomainId, Guid};
 
 use crate::facts::calls::facts::Owner;
 use crate::facts::calls::late::{Cause, Stage};
-use crate::facts::calls::other_thread::Culprit;
+use crate::facts::calls::other_thread::ThreadLabel;
 use crate::facts::calls::report::Trigger;
 use crate::facts::link::LinkKey;
 use crate::facts::names::{DdsName, NodeName, TopicName, TypeName};
@@ -173,7 +173,7 @@ pub enum Diagnosis {
         /// What made them late.
         cause: Cause,
         /// Thread that ran instead or held the lock, in the longest of the last calls.
-        by: Option<Culprit>,
+        by: Option<ThreadLabel>,
         /// Time from ready to the end of that call.
         longest: Duration,
     },
@@ -289,8 +289,8 @@ pub enum Diagnosis {
         /// The offset was wrong by at most this number of nanoseconds.
         uncertainty: i64,
     },
-    /// A publisher and a subscription of one type have no counterpart. Their topics differ so little
-    /// that one of them is probably a mistake.
+    /// A publisher and a subscription of one type have no counterpart. Their topics differ so
+    /// little that one of them is probably a mistake.
     NearMiss {
         /// Topic of the publisher.
         topic: TopicKey,
@@ -299,8 +299,8 @@ pub enum Diagnosis {
         /// How the topics differ.
         difference: Difference,
     },
-    /// A managed node has not been active for at least 5 s, although the configuration expects it or
-    /// its last transition failed.
+    /// A managed node has not been active for at least 5 s, although the configuration expects it
+    /// or its last transition failed.
     NodeInactive {
         /// Domain.
         domain_id: DomainId,
@@ -779,7 +779,7 @@ mod tests {
     }
 
     #[test]
-    fn comparing_identities_gives_the_order_of_the_list() {
+    fn comparing_identities_yields_the_order_of_the_list() {
         let mut all = [
             unmatched("/b", 1, Unmatched::NoEndpoint),
             unmatched("/a", 2, Unmatched::Qos),

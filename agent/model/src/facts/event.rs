@@ -27,13 +27,13 @@ use crate::facts::wall_clock::WallClock;
 use crate::facts::watch::WatchState;
 
 /// Maximum number of events per class and second of the source's clock.
-const MOST: u16 = 512;
+const MAX_EVENTS_PER_SECOND: u16 = 512;
 /// Number of waiting events above which they should be taken before further input.
-const MANY: usize = 1024;
+const MANY_WAITING: usize = 1024;
 /// Maximum length of a text in an event, such as a topic's name, in bytes.
-pub(crate) const TEXT: usize = 256;
+pub(crate) const MAX_TEXT: usize = 256;
 /// Maximum length of a list in an event, such as the participants of a duplicate node.
-const LIST: usize = 8;
+const MAX_LIST: usize = 8;
 
 /// An event.
 #[derive(Clone, Debug, PartialEq)]
@@ -273,7 +273,7 @@ impl Events {
         if second != quota.second && second.checked_add(1) != Some(quota.second) {
             (quota.second, quota.in_second) = (second, 0);
         }
-        if quota.in_second >= MOST {
+        if quota.in_second >= MAX_EVENTS_PER_SECOND {
             quota.overflow += 1;
             return;
         }
@@ -285,11 +285,11 @@ impl Events {
     /// Returns whether so many events wait that they should be taken before further input.
     #[must_use]
     pub fn are_many(&self) -> bool {
-        self.waiting.len() >= MANY
+        self.waiting.len() >= MANY_WAITING
     }
 
     /// Adds samples that reached no receiver to the burst of their writer.
-    pub fn lose(&mut self, loss: &Loss) {
+    pub fn add_loss(&mut self, loss: &Loss) {
         let count = loss.last.steps_since(loss.first).saturating_add(1);
         if let Some(burst) = self.burst(loss.writer, loss.at, (loss.first, loss.last)) {
             burst.losses.count = burst.losses.count.saturating_add(count);
@@ -298,7 +298,7 @@ impl Events {
 
     /// Adds samples that one receiver lost to the burst of their writer. A burst has the count of
     /// the receiver that lost most.
-    pub fn lose_delivery(
+    pub fn add_delivery_loss(
         &mut self,
         writer: Guid,
         receiver: Receiver,
@@ -383,8 +383,8 @@ impl Events {
 
 /// Returns the text, truncated to the maximum length in an event.
 #[must_use]
-pub fn bounded(text: &str) -> &str {
-    text.get(..text.floor_char_boundary(TEXT))
+pub fn truncated(text: &str) -> &str {
+    text.get(..text.floor_char_boundary(MAX_TEXT))
         .unwrap_or_default()
 }
 
@@ -393,13 +393,13 @@ pub fn bounded(text: &str) -> &str {
 pub fn bounded_finding(finding: &Diagnosis) -> Diagnosis {
     let mut finding = finding.clone();
     match &mut finding {
-        Diagnosis::TypeConflict { types, .. } => types.truncate(LIST),
-        Diagnosis::TypeHashConflict { hashes, .. } => hashes.truncate(LIST),
-        Diagnosis::DuplicateNode { participants, .. } => participants.truncate(LIST),
-        Diagnosis::NodeInSeveralDomains { domains, .. } => domains.truncate(LIST),
-        Diagnosis::SharedMachineId { participants, .. } => participants.truncate(LIST),
-        Diagnosis::LogErrors { text, .. } => *text = bounded(text).into(),
-        Diagnosis::ClocksApart { peer, .. } => *peer = bounded(peer).into(),
+        Diagnosis::TypeConflict { types, .. } => types.truncate(MAX_LIST),
+        Diagnosis::TypeHashConflict { hashes, .. } => hashes.truncate(MAX_LIST),
+        Diagnosis::DuplicateNode { participants, .. } => participants.truncate(MAX_LIST),
+        Diagnosis::NodeInSeveralDomains { domains, .. } => domains.truncate(MAX_LIST),
+        Diagnosis::SharedMachineId { participants, .. } => participants.truncate(MAX_LIST),
+        Diagnosis::LogErrors { text, .. } => *text = truncated(text).into(),
+        Diagnosis::ClocksApart { peer, .. } => *peer = truncated(peer).into(),
         Diagnosis::QosIncompatible { .. }
         | Diagnosis::UnmatchedPublisher { .. }
         | Diagnosis::UnmatchedSubscription { .. }
@@ -458,9 +458,9 @@ mod tests {
     #[test]
     fn losses_of_one_writer_become_one_event_when_the_burst_ends() {
         let mut events = Events::default();
-        events.lose(&loss(guid(1), 10, 5, 7));
-        events.lose(&loss(guid(2), 11, 1, 1));
-        events.lose(&loss(guid(1), 12, 9, 9));
+        events.add_loss(&loss(guid(1), 10, 5, 7));
+        events.add_loss(&loss(guid(2), 11, 1, 1));
+        events.add_loss(&loss(guid(1), 12, 9, 9));
         assert!(events.take(WallClock::default()).events.is_empty());
         events.name(guid(2), DomainId(3), &"rt/points".into());
         events.end_bursts(|burst| {
@@ -499,13 +499,13 @@ mod tests {
     #[test]
     fn a_storm_of_one_class_is_counted_and_does_not_displace_the_others() {
         let mut events = Events::default();
-        for number in 0..MOST + 7 {
+        for number in 0..MAX_EVENTS_PER_SECOND + 7 {
             events.push(ModelTime::from_nanoseconds(number.into()), node("/a"));
         }
-        events.lose(&loss(guid(1), 10, 5, 7));
+        events.add_loss(&loss(guid(1), 10, 5, 7));
         events.end_bursts(|_| {});
         let taken = events.take(WallClock::default());
-        assert_eq!(taken.events.len(), usize::from(MOST) + 1);
+        assert_eq!(taken.events.len(), usize::from(MAX_EVENTS_PER_SECOND) + 1);
         assert_eq!(taken.overflow, [(Class::Node, 7)]);
         // Taking events does not renew the quota of a second; the next second has its own.
         events.push(ModelTime::from_nanoseconds(SECOND - 1), node("/b"));
@@ -523,19 +523,19 @@ mod tests {
         let mut events = Events::default();
         let receiver = |number| Receiver::Participant(GuidPrefix([number; 12]));
         let run = |first, last| (SequenceNumber(first), SequenceNumber(last));
-        events.lose_delivery(
+        events.add_delivery_loss(
             guid(1),
             receiver(1),
             ModelTime::from_nanoseconds(10),
             run(5, 7),
         );
-        events.lose_delivery(
+        events.add_delivery_loss(
             guid(1),
             receiver(2),
             ModelTime::from_nanoseconds(10),
             run(6, 7),
         );
-        events.lose_delivery(
+        events.add_delivery_loss(
             guid(1),
             receiver(2),
             ModelTime::from_nanoseconds(11),
@@ -554,7 +554,7 @@ mod tests {
         for number in 0..100 {
             let receiver = Receiver::Participant(GuidPrefix([number; 12]));
             let run = (SequenceNumber(1), SequenceNumber(2));
-            events.lose_delivery(guid(1), receiver, ModelTime::from_nanoseconds(10), run);
+            events.add_delivery_loss(guid(1), receiver, ModelTime::from_nanoseconds(10), run);
         }
         assert!(events.bursts[&guid(1)].losers.is_full());
     }
@@ -562,12 +562,12 @@ mod tests {
     #[test]
     fn long_texts_are_truncated_between_characters() {
         let long: TopicName = "\u{e9}".repeat(5_000).into();
-        assert_eq!(bounded(&long).len(), TEXT);
-        assert_eq!(long.bounded(TEXT).len(), TEXT);
+        assert_eq!(truncated(&long).len(), MAX_TEXT);
+        assert_eq!(long.bounded(MAX_TEXT).len(), MAX_TEXT);
         let short: TopicName = "/points".into();
         assert!(std::sync::Arc::ptr_eq(
             &short.shared(),
-            &short.bounded(TEXT).shared()
+            &short.bounded(MAX_TEXT).shared()
         ));
     }
 }

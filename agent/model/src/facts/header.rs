@@ -10,7 +10,7 @@ use ros2probe_wire::Timestamp;
 use ros2probe_wire::time::SECOND;
 
 /// A stamp that differs more than this from the capture time comes from another clock.
-pub const PLAUSIBLE: Duration = Duration::from_secs(3600);
+pub const MAX_PLAUSIBLE_OFFSET: Duration = Duration::from_secs(3600);
 
 /// Types from packages other than `sensor_msgs` and `geometry_msgs`.
 const OTHERS: [&str; 37] = [
@@ -81,7 +81,7 @@ pub fn begins_with_header(message_type: &str) -> bool {
 pub fn stamp_time((seconds, nanoseconds): (i32, u32), now: Timestamp) -> Option<Timestamp> {
     let seconds = u64::try_from(seconds).ok()?;
     let stamp = Timestamp(seconds * SECOND + u64::from(nanoseconds));
-    (stamp.distance(now) <= PLAUSIBLE).then_some(stamp)
+    (stamp.distance(now) <= MAX_PLAUSIBLE_OFFSET).then_some(stamp)
 }
 
 #[cfg(test)]

@@ -5,14 +5,14 @@
 #[derive(Clone, Copy, Debug)]
 pub struct Identity(u128);
 
-const OFFSET: u128 = 0x6c62_272e_07bb_0142_62b8_2175_6295_c58d;
-const PRIME: u128 = 0x0000_0000_0100_0000_0000_0000_0000_013b;
+const FNV_OFFSET: u128 = 0x6c62_272e_07bb_0142_62b8_2175_6295_c58d;
+const FNV_PRIME: u128 = 0x0000_0000_0100_0000_0000_0000_0000_013b;
 
 impl Identity {
     /// Starts an identity of this kind.
     #[must_use]
     pub fn of(kind: &[u8]) -> Self {
-        let mut identity = Self(OFFSET);
+        let mut identity = Self(FNV_OFFSET);
         identity.add(kind);
         identity
     }
@@ -20,7 +20,7 @@ impl Identity {
     /// Adds bytes and a boundary after them.
     pub fn add(&mut self, bytes: &[u8]) {
         for byte in bytes.iter().chain(&[0xff]) {
-            self.0 = (self.0 ^ u128::from(*byte)).wrapping_mul(PRIME);
+            self.0 = (self.0 ^ u128::from(*byte)).wrapping_mul(FNV_PRIME);
         }
     }
 

@@ -13,7 +13,7 @@ use crate::facts::model_time::ModelTime;
 use crate::facts::tables::{DiscoveryEvents, LatestDeliveryLosses, LatestLosses, MissingSamples};
 
 /// Number of the latest entries that a new loss may extend.
-const RECENT: usize = 16;
+const MAX_EXTENDED: usize = 16;
 
 /// A change of a participant, endpoint or node.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -78,7 +78,7 @@ impl Journal {
     }
 
     /// Records samples that subscriptions will not receive, until the next [`Self::take_missing`].
-    pub fn leave_missing(&mut self, missing: Missing) {
+    pub fn add_missing(&mut self, missing: Missing) {
         if let Some(last) = self.missing.last_mut()
             && (last.writer, last.reason) == (missing.writer, missing.reason)
             && missing.reason != MissedReason::Incomplete
@@ -97,9 +97,9 @@ impl Journal {
 
     /// Adds a loss, extending the last entry if the loss continues it. The loss becomes an event
     /// unless its receivers report it.
-    pub fn lose(&mut self, loss: Loss, has_receivers: bool) {
+    pub fn add_loss(&mut self, loss: Loss, has_receivers: bool) {
         if !has_receivers {
-            self.events.lose(&loss);
+            self.events.add_loss(&loss);
         }
         if let Some(last) = self.losses.back_mut()
             && last.writer == loss.writer
@@ -112,8 +112,8 @@ impl Journal {
     }
 
     /// Adds a receiver's loss, extending one of the latest entries if the loss continues it.
-    pub fn lose_delivery(&mut self, loss: DeliveryLoss) {
-        let whose = |loss: &DeliveryLoss| {
+    pub fn add_delivery_loss(&mut self, loss: DeliveryLoss) {
+        let key_of = |loss: &DeliveryLoss| {
             let DeliveryLoss {
                 writer,
                 participant,
@@ -124,9 +124,9 @@ impl Journal {
             } = *loss;
             (writer, participant, socket, destination, cause)
         };
-        let mut recent = self.delivery_losses.iter_mut().rev().take(RECENT);
+        let mut recent = self.delivery_losses.iter_mut().rev().take(MAX_EXTENDED);
         let continued =
-            recent.find(|entry| whose(entry) == whose(&loss) && entry.last.precedes(loss.first));
+            recent.find(|entry| key_of(entry) == key_of(&loss) && entry.last.precedes(loss.first));
         if let Some(entry) = continued {
             (entry.last, entry.at) = (loss.last, loss.at);
             return;

@@ -264,7 +264,7 @@ impl Limit {
 
     /// Returns whether reaching the limit hides a part of the robot.
     #[must_use]
-    pub const fn blinds(self) -> bool {
+    pub const fn hides_data(self) -> bool {
         matches!(
             self,
             Self::Participants
@@ -326,33 +326,33 @@ impl Limits {
     /// Memory in addition to the limits, in bytes: the idle agent with its rings and the kernel's
     /// maps (14 MiB), stored events and two views. The history of measured topics and the channels
     /// of viewers are included.
-    pub const BESIDE: usize = 33 << 20;
+    pub const CONSTANT_BYTES: usize = 33 << 20;
 
     /// Memory of Zenoh at its caps, in bytes. It consists of tables with a cap in bytes (42 MiB),
     /// messages in FRAGMENTs (20 MiB), and incomplete batches and waiting segments (20 MiB).
-    pub const ZENOH: usize = 82 << 20;
+    pub const ZENOH_BYTES: usize = 82 << 20;
 
     /// Memory of the last messages of transient-local writers, in bytes: kept messages (16 MiB),
     /// incomplete ones (4 MiB), and the writers.
-    pub const LATCHED: usize = 21 << 20;
+    pub const LATCHED_BYTES: usize = 21 << 20;
 
     /// Memory of calls inside processes at the caps of their tables, in bytes. Processes and
     /// handles, with late calls and copies in snapshots and pages, take 83 MiB, and the kernel's
     /// tables 12 MiB.
-    pub const INSIDE: usize = 95 << 20;
+    pub const INSIDE_BYTES: usize = 95 << 20;
 
     /// Memory of types that nodes described, and of TypeObjects, in bytes: their definitions (8 MiB
     /// each), and responses that wait (2 MiB).
-    pub const TYPES: usize = 18 << 20;
+    pub const TYPE_BYTES: usize = 18 << 20;
 
-    /// Memory of what the robot itself says, in bytes. Logs take 6 MiB, parameters and their changes
-    /// 4 MiB, values of diagnostics and messages with fields 1 MiB each. The rest is for transforms,
-    /// frames, stamps and states of nodes.
-    pub const ROBOT: usize = 14 << 20;
+    /// Memory of what the robot itself says, in bytes. Logs take 6 MiB, parameters and their
+    /// changes 4 MiB, values of diagnostics and messages with fields 1 MiB each. The rest is for
+    /// transforms, frames, stamps and states of nodes.
+    pub const ROBOT_BYTES: usize = 14 << 20;
 
-    /// Memory of the history on disk while a minute is written, in bytes: its rows and blocks (6 MiB,
-    /// ten minutes merged into steps included), and events (4 MiB).
-    pub const HISTORY: usize = 10 << 20;
+    /// Memory of the history on disk while a minute is written, in bytes: its rows and blocks (6
+    /// MiB, ten minutes merged into steps included), and events (4 MiB).
+    pub const HISTORY_BYTES: usize = 10 << 20;
 
     /// Returns the memory in bytes that all limits together allow.
     #[must_use]

@@ -178,9 +178,9 @@ impl TopicLoss {
         }
     }
 
-    /// Records the last share of a writer that left, if it lost more than the others that left in this
-    /// second.
-    pub(crate) const fn leave(&mut self, share: LossShare) {
+    /// Records the last share of a writer that left, if it lost more than the others that left in
+    /// this second.
+    pub(crate) const fn note_departed(&mut self, share: LossShare) {
         if share.lost > self.departed.lost {
             self.departed = share;
         }
@@ -253,8 +253,8 @@ mod tests {
     #[test]
     fn the_losses_of_a_writer_that_left_count_in_its_last_second() {
         let mut loss = TopicLoss::default();
-        loss.leave(share_of(4, 8));
-        loss.leave(share_of(1, 2));
+        loss.note_departed(share_of(4, 8));
+        loss.note_departed(share_of(1, 2));
         loss.end_second(std::iter::empty(), share_of(0, 10));
         assert_eq!((loss.total, loss.window), (share_of(4, 8), share_of(4, 8)));
         loss.end_second(std::iter::empty(), share_of(0, 20));

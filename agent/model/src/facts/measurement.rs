@@ -13,7 +13,7 @@ pub struct Measurement {
     pub messages: u64,
     /// Payload bytes of all messages, including encapsulation (as `ros2 topic bw` counts).
     pub bytes: u64,
-    /// Samples settled as lost: a gap that was neither excused nor filled in time.
+    /// Samples settled as lost: a gap that was neither irrelevant nor filled in time.
     pub lost: u64,
     /// Samples that the worst subscriber expected and lost; for a writer, those that did not reach
     /// this host.
@@ -24,8 +24,8 @@ pub struct Measurement {
     pub duplicates: u64,
     /// Samples whose fragments never became complete (also in `lost` once settled).
     pub incomplete: u64,
-    /// Samples excused by GAP, by ACKNACKs of readers that have them, or because the kernel did not
-    /// know their writer yet.
+    /// Samples irrelevant by GAP, by ACKNACKs of readers that have them, or because the kernel did
+    /// not know their writer yet.
     pub irrelevant: u64,
     /// Time of the last new sample.
     pub last_message: Option<ModelTime>,
@@ -209,7 +209,7 @@ impl Delivered {
     }
 
     /// Adds losses by this cause.
-    pub const fn lose(&mut self, cause: LossCause, count: u64) {
+    pub const fn add_lost(&mut self, cause: LossCause, count: u64) {
         match cause {
             LossCause::Sender => self.lost_at_sender += count,
             LossCause::BeforeHost => self.lost_before_host += count,

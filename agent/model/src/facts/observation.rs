@@ -258,7 +258,7 @@ impl Head {
 
     /// Returns whether its sender is on this host, as far as the path shows that.
     #[must_use]
-    pub fn leaves(&self) -> bool {
+    pub fn is_outgoing(&self) -> bool {
         self.is_sent()
             || self.is_in_shared_memory()
             || !self.is_at_socket() && self.interface == LOOPBACK

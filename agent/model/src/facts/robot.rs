@@ -9,7 +9,7 @@ use crate::facts::model_time::ModelTime;
 use crate::facts::names::{NodeName, TopicName};
 
 /// End of the names of topics on which an aggregator repeats the statuses of others.
-const AGGREGATED: &str = "diagnostics_agg";
+const AGGREGATED_SUFFIX: &str = "diagnostics_agg";
 
 /// The last status of a part of the robot.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -58,7 +58,7 @@ impl DiagnosticStatus {
     /// Returns whether an aggregator repeats what other topics say.
     #[must_use]
     pub fn is_aggregated(&self) -> bool {
-        self.topic.ends_with(AGGREGATED)
+        self.topic.ends_with(AGGREGATED_SUFFIX)
     }
 }
 
@@ -125,8 +125,8 @@ pub struct TransformFault {
     /// Edges with this fault and these names, of which the fault has the first one; or topics that
     /// name the frame.
     pub edges: usize,
-    /// Nodes that broadcast the edge, the roots of the trees, or topics that name the frame; at most
-    /// four.
+    /// Nodes that broadcast the edge, the roots of the trees, or topics that name the frame; at
+    /// most four.
     pub names: Vec<Arc<str>>,
 }
 

@@ -250,7 +250,7 @@ impl TryFrom<ExpectationValues> for Expectations {
             publishers.map(f64::from),
             subscribers.map(f64::from),
         ];
-        for ((key, low, high), value) in RANGES.into_iter().zip(values) {
+        for ((key, low, high), value) in EXPECTATION_RANGES.into_iter().zip(values) {
             if let Some(value) = value.filter(|value| !(low..=high).contains(value)) {
                 return Err(ExpectationError::OutOfRange {
                     key,
@@ -289,7 +289,7 @@ pub const MAX_GLOBS: usize = 256;
 pub const MAX_GLOB_BYTES: usize = 16 << 10;
 
 /// Valid ranges of expectations, as in the configuration's schema.
-const RANGES: [(&str, f64, f64); 8] = [
+const EXPECTATION_RANGES: [(&str, f64, f64); 8] = [
     ("min_rate_hz", 0.0, 1_000_000.0),
     ("max_rate_hz", 0.0, 1_000_000.0),
     // The longest window is `rate::SECONDS`.
@@ -556,7 +556,7 @@ mod tests {
     }
 
     #[test]
-    fn globs_that_are_too_many_or_too_long_in_total_are_refused() {
+    fn too_many_or_too_long_globs_are_refused() {
         let full_of_stars = format!("/{}", "*a".repeat(120));
         assert_eq!(check_pattern(&full_of_stars), Err(PatternError::ManyStars));
         let names = (0..5000).map(|number| format!("/topic_{number}"));

@@ -44,7 +44,7 @@ pub use memory::{Memory, hexadecimal};
 use pending::PendingTable;
 pub use priority::Priority;
 
-const PENDING_FOR: Duration = Duration::from_secs(60);
+const PENDING_TIMEOUT: Duration = Duration::from_secs(60);
 /// Maximum length of a topic or type name: `string<256>` in the builtin topics of DDS. Longer names
 /// are rejected to bound memory.
 const MAX_NAME_LEN: usize = 256;
@@ -98,7 +98,7 @@ pub struct Discovery {
     watchlist: Arc<Watchlist>,
     participants: Bounded<Counted<Participants>, HashMap<GuidPrefix, Box<Participant>>>,
     endpoints: Bounded<Counted<Endpoints>, HashMap<Guid, Box<Endpoint>>>,
-    applicants: PendingTable<Applicants, GuidPrefix, Box<Participant>>,
+    pending_participants: PendingTable<Applicants, GuidPrefix, Box<Participant>>,
     pending_endpoints: PendingTable<PendingEndpoints, Guid, PendingEndpoint>,
     pending_nodes: Bounded<PendingNodeLists, HashMap<GuidPrefix, PendingNodes>>,
     disposals: Disposals,
@@ -123,7 +123,7 @@ impl Discovery {
             watchlist: Arc::default(),
             participants: Bounded::capped(caps.participants),
             endpoints: Bounded::capped(caps.endpoints),
-            applicants: PendingTable::new(),
+            pending_participants: PendingTable::new(),
             pending_endpoints: PendingTable::new(),
             pending_nodes: Bounded::default(),
             disposals: Disposals::default(),
@@ -189,7 +189,7 @@ impl Discovery {
     pub fn knows(&self, prefix: GuidPrefix) -> bool {
         let mut waiting = self.pending_endpoints.range(endpoints_of(prefix));
         self.participants.contains_key(&prefix)
-            || self.applicants.priority(&prefix).is_some()
+            || self.pending_participants.priority(&prefix).is_some()
             || waiting.next().is_some()
     }
 
@@ -218,14 +218,14 @@ impl Discovery {
                 participant.seen(at);
                 Some(participant.priority())
             }
-            None if evidence == Priority::NOTHING => None,
-            None => self.applicants.priority(&prefix),
+            None if evidence == Priority::NO_EVIDENCE => None,
+            None => self.pending_participants.priority(&prefix),
         };
         priority.is_some_and(|priority| priority.or(evidence) != priority)
     }
 
     /// Records that a message of this participant came by TCP.
-    pub fn came_by_tcp(&mut self, prefix: GuidPrefix) {
+    pub fn note_tcp(&mut self, prefix: GuidPrefix) {
         if let Some(participant) = self.participants.get_mut(&prefix) {
             participant.came_by_tcp = true;
         }
@@ -245,14 +245,14 @@ impl Discovery {
             self.adopt_pending(prefix, at, journal);
             return false;
         }
-        let Some((priority, participant)) = self.applicants.remove(&prefix) else {
+        let Some((priority, participant)) = self.pending_participants.remove(&prefix) else {
             return false;
         };
-        self.enter(prefix, participant, priority.or(evidence), at, journal)
+        self.admit_participant(prefix, participant, priority.or(evidence), at, journal)
     }
 
     /// Updates for which participants a socket of this host sends.
-    pub fn locate(&mut self, is_local: impl Fn(&GuidPrefix) -> bool) {
+    pub fn update_locality(&mut self, is_local: impl Fn(&GuidPrefix) -> bool) {
         for (prefix, participant) in &mut self.participants {
             participant.local = is_local(prefix);
         }
@@ -286,14 +286,14 @@ impl Discovery {
                 let entity = DiscoveredEntity::participant(domain_id, guid, &proxy);
                 self.note(&entity, Event::Changed, origin.at, journal);
             }
-            self.move_to(guid.prefix, domain_id, source);
+            self.set_domain(guid.prefix, domain_id, source);
             self.learn(guid.prefix, evidence, origin.at, journal);
             return;
         }
         let waiting = self.pending_endpoints.range(endpoints_of(guid.prefix));
         let known = waiting.map(|(_, priority)| priority);
         let known = known.fold(evidence, Priority::or);
-        let before = self.applicants.remove(&guid.prefix);
+        let before = self.pending_participants.remove(&guid.prefix);
         let priority = before.map_or(known, |(priority, _)| priority.or(known));
         let participant = Box::new(Participant {
             proxy,
@@ -311,7 +311,7 @@ impl Discovery {
             domain_source: source,
             nodes_from: None,
         });
-        self.enter(guid.prefix, participant, priority, origin.at, journal);
+        self.admit_participant(guid.prefix, participant, priority, origin.at, journal);
     }
 
     /// Records the SPDP disposal of a participant.
@@ -320,7 +320,7 @@ impl Discovery {
             return;
         }
         self.disposals.add(guid, origin);
-        self.applicants.remove(&guid.prefix);
+        self.pending_participants.remove(&guid.prefix);
         self.remove(guid.prefix, origin.at, Some(Event::Disposed), journal);
     }
 
@@ -344,17 +344,17 @@ impl Discovery {
         for (end, prefix) in expired {
             self.remove(prefix, end, Some(Event::Expired), journal);
         }
-        let fresh = |at: ModelTime| at + PENDING_FOR > now;
+        let fresh = |at: ModelTime| at + PENDING_TIMEOUT > now;
         let participants = &self.participants;
         self.pending_endpoints
             .retain(|guid, pending| fresh(pending.at) || participants.contains_key(&guid.prefix));
-        self.applicants
+        self.pending_participants
             .retain(|_, applicant| fresh(applicant.last_seen));
         self.pending_nodes.retain(|_, pending| fresh(pending.at));
     }
 
     /// Adds a new participant and returns true. If the table is full, the participant waits.
-    fn enter(
+    fn admit_participant(
         &mut self,
         prefix: GuidPrefix,
         mut participant: Box<Participant>,
@@ -366,7 +366,7 @@ impl Discovery {
         let is_full = self.participants.is_full();
         if is_full && !self.evict_for(Table::Participants, Newcomer { guid, priority }, at) {
             self.participants.refuse();
-            self.applicants.put(prefix, priority, participant);
+            self.pending_participants.put(prefix, priority, participant);
             return false;
         }
         (participant.local, participant.sends) = (priority.local, priority.sends);
@@ -417,7 +417,7 @@ impl Discovery {
     }
 
     /// Moves a participant with its endpoints and nodes to a domain from a more reliable source.
-    fn move_to(&mut self, prefix: GuidPrefix, domain_id: DomainId, source: DomainSource) {
+    fn set_domain(&mut self, prefix: GuidPrefix, domain_id: DomainId, source: DomainSource) {
         let Some(participant) = self.participants.get_mut(&prefix) else {
             return;
         };

@@ -14,7 +14,7 @@ use ros2probe_wire::{Guid, SequenceNumber};
 /// Maximum size of a sample in bytes, far above any discovery data.
 const MAX_SAMPLE: u32 = 256 * 1024;
 /// Memory per fragment in addition to its bytes.
-const OVERHEAD: usize = 64;
+const FRAGMENT_OVERHEAD: usize = 64;
 
 /// The unfinished samples, oldest first.
 #[derive(Debug, Default)]
@@ -87,8 +87,8 @@ impl DiscoveryFragments {
                     break;
                 };
                 if sample.fragments.insert(number, chunk.into()).is_none() {
-                    sample.bytes += chunk.len() + OVERHEAD;
-                    self.bytes.add(chunk.len() + OVERHEAD);
+                    sample.bytes += chunk.len() + FRAGMENT_OVERHEAD;
+                    self.bytes.add(chunk.len() + FRAGMENT_OVERHEAD);
                 }
             }
         }
@@ -113,12 +113,12 @@ impl DiscoveryFragments {
             size: fragments.sample_size,
             fragment_size: fragments.fragment_size,
             fragments: BTreeMap::new(),
-            bytes: OVERHEAD,
+            bytes: FRAGMENT_OVERHEAD,
         });
         if let Some(oldest) = evicted {
             self.evict(&oldest);
         }
-        self.bytes.add(OVERHEAD);
+        self.bytes.add(FRAGMENT_OVERHEAD);
         self.samples.len() - 1
     }
 

@@ -6,7 +6,7 @@ use ros2probe_wire::time::SECOND;
 use crate::facts::model_time::ModelTime;
 
 /// Bytes charged per datagram in addition to its payload, so that small datagrams are not free.
-const OVERHEAD: usize = 64;
+const DATAGRAM_OVERHEAD: usize = 64;
 
 /// Bytes that may be captured: a burst of at most `most`, and `rate` per second on average.
 #[derive(Clone, Copy, Debug)]
@@ -45,7 +45,7 @@ impl Allowance {
 
     /// Charges a datagram with this many bytes of payload. Returns whether the allowance covers it.
     pub(crate) fn spend(&mut self, payload: usize, now: ModelTime) -> bool {
-        let cost = u64::try_from(payload.saturating_add(OVERHEAD)).unwrap_or(u64::MAX);
+        let cost = u64::try_from(payload.saturating_add(DATAGRAM_OVERHEAD)).unwrap_or(u64::MAX);
         let left = self.left(now).checked_sub(cost);
         self.left = left.unwrap_or(0);
         left.is_some()

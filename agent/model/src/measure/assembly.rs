@@ -17,27 +17,27 @@ use foldhash::HashMap;
 use ros2probe_wire::{Guid, SequenceNumber};
 
 /// Memory per sample, and per fragment that arrived early, in addition to its bytes.
-const OVERHEAD: usize = 128;
+const ENTRY_OVERHEAD: usize = 128;
 /// An unfinished sample is dropped after this long without a fragment.
 const FRAGMENT_TIMEOUT: Duration = Duration::from_secs(30);
 /// Minimum allocation for a sample, in bytes.
-const LEAST: usize = 4096;
+const MIN_ALLOCATION: usize = 4096;
 /// Minimum size of a buffer that is reused: the kernel would have to clear each page of a new one.
-const LARGE: usize = 128 << 10;
+const MIN_REUSED_BUFFER: usize = 128 << 10;
 /// Maximum number of buffers kept for reuse, and the time without a sample after which they are
 /// freed.
-const KEPT: usize = 4;
-const KEPT_FOR: Duration = Duration::from_secs(10);
+const MAX_SPARE_BUFFERS: usize = 4;
+const SPARE_BUFFER_LIFETIME: Duration = Duration::from_secs(10);
 
 /// All unfinished samples.
 #[derive(Debug)]
 pub struct Assembly {
     parts: Bounded<AssembledSamples, HashMap<(Guid, SequenceNumber), Part>>,
     /// The same samples in the order in which they began.
-    ages: Bounded<AssembledSamples, BTreeMap<u64, (Guid, SequenceNumber)>>,
+    by_age: Bounded<AssembledSamples, BTreeMap<u64, (Guid, SequenceNumber)>>,
     /// Payloads that were passed on, oldest first. A buffer is free once its readers have dropped
     /// it.
-    passed: VecDeque<(ModelTime, Bytes)>,
+    handed_out: VecDeque<(ModelTime, Bytes)>,
     begun: u64,
     bytes: usize,
     limit: usize,
@@ -57,7 +57,7 @@ struct Part {
     ahead: BTreeMap<u32, Box<[u8]>>,
     /// Bytes of `ahead`, including the overhead of each entry.
     ahead_bytes: usize,
-    touched: ModelTime,
+    last_changed: ModelTime,
 }
 
 impl Assembly {
@@ -66,8 +66,8 @@ impl Assembly {
     pub fn new(limit: usize) -> Self {
         Self {
             parts: Bounded::default(),
-            ages: Bounded::default(),
-            passed: VecDeque::new(),
+            by_age: Bounded::default(),
+            handed_out: VecDeque::new(),
             begun: 0,
             bytes: 0,
             limit,
@@ -93,12 +93,12 @@ impl Assembly {
                 self.evict();
             }
             self.begun += 1;
-            self.ages.insert(self.begun, key);
+            self.by_age.insert(self.begun, key);
             let part = Part {
                 head: self.buffer(size),
                 ..Part::new(self.begun, size, fragment_size, now)
             };
-            self.bytes += part.bytes() + OVERHEAD;
+            self.bytes += part.bytes() + ENTRY_OVERHEAD;
             self.parts.insert(key, part);
         }
         let Some(part) = self.parts.get_mut(&key) else {
@@ -109,15 +109,15 @@ impl Assembly {
             return;
         }
         let before = part.bytes();
-        part.touched = now;
+        part.last_changed = now;
         let start = match sample.content {
             Content::Data { .. } => 1,
             Content::DataFrag(fragments) => fragments.starting,
         };
         part.put(start, payload);
         self.bytes = self.bytes + part.bytes() - before;
-        while self.bytes + self.passed_bytes() + other_bytes > self.limit {
-            if self.passed.pop_front().is_none() && !self.evict() {
+        while self.bytes + self.handed_out_bytes() + other_bytes > self.limit {
+            if self.handed_out.pop_front().is_none() && !self.evict() {
                 break;
             }
         }
@@ -125,7 +125,7 @@ impl Assembly {
 
     /// Drops the oldest sample. Returns whether there was one.
     fn evict(&mut self) -> bool {
-        let oldest = self.ages.first_key_value().map(|(_, key)| *key);
+        let oldest = self.by_age.first_key_value().map(|(_, key)| *key);
         if let Some((writer, number)) = oldest {
             self.forget(writer, number);
             self.evictions += 1;
@@ -147,18 +147,22 @@ impl Assembly {
             return None;
         }
         let payload = Bytes::from(part.head);
-        if (LARGE..=self.limit / 2).contains(&payload.len()) {
+        if (MIN_REUSED_BUFFER..=self.limit / 2).contains(&payload.len()) {
             let others = self.limit / 2 - payload.len();
-            while self.passed.len() >= KEPT || self.passed_bytes() > others {
-                self.passed.pop_front();
+            while self.handed_out.len() >= MAX_SPARE_BUFFERS || self.handed_out_bytes() > others {
+                self.handed_out.pop_front();
             }
-            self.passed.push_back((part.touched, payload.clone()));
+            self.handed_out
+                .push_back((part.last_changed, payload.clone()));
         }
         Some(payload)
     }
 
-    fn passed_bytes(&self) -> usize {
-        self.passed.iter().map(|(_, payload)| payload.len()).sum()
+    fn handed_out_bytes(&self) -> usize {
+        self.handed_out
+            .iter()
+            .map(|(_, payload)| payload.len())
+            .sum()
     }
 
     /// Returns an empty buffer. A large one may be that of an earlier payload that has no reader
@@ -167,8 +171,10 @@ impl Assembly {
         let is_free = |(_, payload): &(ModelTime, Bytes)| {
             (size..=2 * size).contains(&payload.len()) && payload.is_unique()
         };
-        let index = (size >= LARGE).then(|| self.passed.iter().position(is_free));
-        let free = index.flatten().and_then(|index| self.passed.remove(index));
+        let index = (size >= MIN_REUSED_BUFFER).then(|| self.handed_out.iter().position(is_free));
+        let free = index
+            .flatten()
+            .and_then(|index| self.handed_out.remove(index));
         let mut buffer = free.map_or_else(Vec::new, |(_, payload)| Vec::from(payload));
         buffer.clear();
         buffer
@@ -186,17 +192,18 @@ impl Assembly {
 
     /// Drops samples that have received no fragment for a long time.
     pub fn expire(&mut self, now: ModelTime) {
-        self.retain(|_, part| part.touched + FRAGMENT_TIMEOUT > now);
-        self.passed.retain(|(at, _)| *at + KEPT_FOR > now);
+        self.retain(|_, part| part.last_changed + FRAGMENT_TIMEOUT > now);
+        self.handed_out
+            .retain(|(at, _)| *at + SPARE_BUFFER_LIFETIME > now);
     }
 
     fn retain(&mut self, mut keep: impl FnMut(&(Guid, SequenceNumber), &Part) -> bool) {
-        let (ages, bytes) = (&mut self.ages, &mut self.bytes);
+        let (ages, bytes) = (&mut self.by_age, &mut self.bytes);
         self.parts.retain(|key, part| {
             let keeps = keep(key, part);
             if !keeps {
                 ages.remove(&part.age);
-                *bytes -= part.bytes() + OVERHEAD;
+                *bytes -= part.bytes() + ENTRY_OVERHEAD;
             }
             keeps
         });
@@ -204,8 +211,8 @@ impl Assembly {
 
     fn remove(&mut self, key: (Guid, SequenceNumber)) -> Option<Part> {
         let part = self.parts.remove(&key)?;
-        self.ages.remove(&part.age);
-        self.bytes -= part.bytes() + OVERHEAD;
+        self.by_age.remove(&part.age);
+        self.bytes -= part.bytes() + ENTRY_OVERHEAD;
         Some(part)
     }
 }
@@ -220,7 +227,7 @@ impl Part {
             next: 1,
             ahead: BTreeMap::new(),
             ahead_bytes: 0,
-            touched: now,
+            last_changed: now,
         }
     }
 
@@ -234,8 +241,8 @@ impl Part {
             let known = self.ahead.get(&start).map_or(0, |known| known.len());
             if bytes.len() > known {
                 let entry = self.ahead.insert(start, bytes.into());
-                let before = entry.map_or(0, |entry| entry.len() + OVERHEAD);
-                self.ahead_bytes = self.ahead_bytes + bytes.len() + OVERHEAD - before;
+                let before = entry.map_or(0, |entry| entry.len() + ENTRY_OVERHEAD);
+                self.ahead_bytes = self.ahead_bytes + bytes.len() + ENTRY_OVERHEAD - before;
             }
             return;
         }
@@ -244,7 +251,7 @@ impl Part {
             && *entry.key() <= self.next
         {
             let (start, bytes) = entry.remove_entry();
-            self.ahead_bytes -= bytes.len() + OVERHEAD;
+            self.ahead_bytes -= bytes.len() + ENTRY_OVERHEAD;
             self.append(start, &bytes);
         }
     }
@@ -266,7 +273,7 @@ impl Part {
         let bytes = bytes.get(..len).unwrap_or_default();
         let needed = self.head.len() + len;
         if needed > self.head.capacity() {
-            let roomy = needed.max(2 * self.head.capacity()).max(LEAST);
+            let roomy = needed.max(2 * self.head.capacity()).max(MIN_ALLOCATION);
             let more = roomy.min(self.size) - self.head.len();
             self.head.reserve_exact(more);
         }
@@ -355,7 +362,7 @@ mod tests {
                 put(&mut assembly, &record, &bytes, 0);
             }
             prop_assert_eq!(assembly.take(writer(1), SequenceNumber(5)).map(|bytes| bytes.to_vec()), Some(whole));
-            prop_assert_eq!((assembly.bytes, assembly.ages.len()), (0, 0));
+            prop_assert_eq!((assembly.bytes, assembly.by_age.len()), (0, 0));
         }
     }
 
@@ -464,7 +471,7 @@ mod tests {
         put(&mut assembly, &hostile, &[0; 100], 0);
         let far = fragment(writer(1), 1, 60_000, 1, u32::MAX, 65_535);
         put(&mut assembly, &far, &[0; 100], 0);
-        assert!(assembly.bytes < LEAST + 1000, "{}", assembly.bytes);
+        assert!(assembly.bytes < MIN_ALLOCATION + 1000, "{}", assembly.bytes);
     }
 
     #[test]
@@ -507,8 +514,8 @@ mod tests {
         assert_ne!(next(4, size / 4).0, second, "it is much larger");
         assert_eq!(next(5, size).2, 0);
         assert_eq!(held, vec![1; 300_000]);
-        assembly.expire(ModelTime::ZERO + 2 * KEPT_FOR + FRAGMENT_TIMEOUT);
-        assert_eq!(assembly.passed_bytes(), 0);
+        assembly.expire(ModelTime::ZERO + 2 * SPARE_BUFFER_LIFETIME + FRAGMENT_TIMEOUT);
+        assert_eq!(assembly.handed_out_bytes(), 0);
     }
 
     #[test]

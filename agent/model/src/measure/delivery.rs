@@ -26,26 +26,26 @@ use crate::facts::observation::{AckNack, Content, Gap, Heartbeat, Sample};
 use crate::facts::route::Direction;
 use crate::facts::route::{Receiver, Route};
 use crate::facts::tables::WithheldLosses;
-use crate::measure::loss_causes::{LossCauses, REASSEMBLY};
+use crate::measure::loss_causes::{LossCauses, REASSEMBLY_TIMEOUT};
 use crate::measure::reception::{CompleteSample, Outcome, Reception};
 use crate::measure::samples::Budget;
-use crate::measure::sequence::REACH;
+use crate::measure::sequence::MAX_TRUSTED_JUMP;
 use crate::measure::undelivered::Undelivered;
 use crate::measure::writer::{BEST_EFFORT_WINDOW, settle_window};
 use accounting::Accounting;
 pub use accounting::Totals;
 
-/// Maximum number of samples, missed while there was no reader, that are excused one by one. If
-/// there are more, the delivery restarts.
-const EXCUSED: u64 = 512;
+/// Maximum number of samples, missed while there was no reader, that are marked irrelevant one by
+/// one. If there are more, the delivery restarts.
+const MAX_IRRELEVANT_AT_START: u64 = 512;
 /// Samples that left this host less than this ago may still arrive.
-const UNDER_WAY: Duration = Duration::from_secs(1);
+const MAX_TRANSIT_TIME: Duration = Duration::from_secs(1);
 /// Samples that left for a receiver count as lost if it shows no sign of life for this time. Socket
 /// diagnostics of the kernel report a closed socket earlier.
 const SILENCE: Duration = Duration::from_secs(18);
-const FIRST_MOMENTS: Duration = Duration::from_secs(5);
+const START_GRACE: Duration = Duration::from_secs(5);
 /// A run of pending losses longer than this is settled when two deliveries merge.
-const LONG_RUN: u64 = 256;
+const MIN_LONG_RUN: u64 = 256;
 
 /// State outside the delivery that an observation changes.
 #[derive(Debug)]
@@ -82,15 +82,15 @@ pub struct Delivery {
     first_seen: ModelTime,
     last_seen: ModelTime,
     /// Time at which a matching reader last appeared or capture missed bytes; earlier gaps are
-    /// excused.
+    /// irrelevant.
     opened: ModelTime,
     /// Time at which the oldest sample that has not arrived left this host for the receiver.
     waiting: Option<ModelTime>,
     /// Whether samples that left after `waiting` are already counted as lost.
     presumed_lost: bool,
-    /// Number of samples that left this host for the receiver at least [`UNDER_WAY`] ago and have
-    /// not arrived.
-    under_way: u64,
+    /// Number of samples that left this host for the receiver at least [`MAX_TRANSIT_TIME`] ago and
+    /// have not arrived.
+    overdue: u64,
     /// Losses of the last seconds.
     recent: RecentLoss,
     /// Whether all readers are best effort: they get no retransmissions and no HEARTBEATs.
@@ -101,8 +101,8 @@ pub struct Delivery {
     withheld: Option<Bounded<WithheldLosses, VecDeque<DeliveryLoss>>>,
     /// The TCP connection of the newest sample, and the first number that only it carries.
     connection: Option<(Connection, SequenceNumber)>,
-    /// Number of samples that the writer's totals contain twice. Totals never decrease, so this many
-    /// further samples are not added to them.
+    /// Number of samples that the writer's totals contain twice. Totals never decrease, so this
+    /// many further samples are not added to them.
     counted_twice: u64,
 }
 
@@ -122,7 +122,7 @@ impl Delivery {
             opened: ModelTime::ZERO,
             waiting: None,
             presumed_lost: false,
-            under_way: 0,
+            overdue: 0,
             recent: RecentLoss::default(),
             best_effort: false,
             uses_network: false,
@@ -149,13 +149,13 @@ impl Delivery {
     }
 
     /// Sets the route of a receiver whose socket was unknown.
-    pub const fn lead_to(&mut self, route: Route) {
+    pub const fn set_route(&mut self, route: Route) {
         self.receiver = Receiver::Route(route);
     }
 
     /// Returns the route by which new samples arrive.
     #[must_use]
-    pub const fn main(&self) -> Route {
+    pub const fn main_route(&self) -> Route {
         self.main
     }
 
@@ -190,7 +190,7 @@ impl Delivery {
 
     /// Returns whether this sample is known to exist but has not arrived.
     #[must_use]
-    pub fn misses(&self, number: SequenceNumber) -> bool {
+    pub fn is_missing(&self, number: SequenceNumber) -> bool {
         let sequence = self.reception.sequence();
         sequence.started()
             && number >= sequence.first()
@@ -216,13 +216,13 @@ impl Delivery {
     }
 
     /// Records that a reader appeared, or that capture missed bytes. Gaps from before `at` are
-    /// excused.
+    /// irrelevant.
     pub fn open(&mut self, at: ModelTime) {
         self.opened = self.opened.max(at);
     }
 
     /// Records that bytes for the receiver were not captured: samples missing before `at` are
-    /// excused, also those of which some fragments arrived.
+    /// irrelevant, also those of which some fragments arrived.
     pub fn interrupt(&mut self, at: ModelTime) {
         self.open(at);
         self.reception.interrupt();
@@ -236,7 +236,7 @@ impl Delivery {
     /// Records that the last reader is gone: samples after the last received one do not count as
     /// lost.
     pub fn close(&mut self, budget: &mut Budget) {
-        (self.waiting, self.presumed_lost, self.under_way) = (None, false, 0);
+        (self.waiting, self.presumed_lost, self.overdue) = (None, false, 0);
         self.reception.close(budget);
     }
 
@@ -252,7 +252,7 @@ impl Delivery {
         sample: &Sample,
         context: &mut DeliveryContext<'_>,
     ) -> (bool, Option<CompleteSample>) {
-        self.touch(context.now);
+        self.note_seen(context.now);
         (self.waiting, self.presumed_lost, self.uses_network) = (None, false, true);
         self.connect(sample);
         if self.undelivered.is_empty() {
@@ -272,7 +272,7 @@ impl Delivery {
 
     /// Records that the socket's buffer was full for this DATA or DATA_FRAG.
     pub fn socket_full(&mut self, sample: &Sample, context: &mut DeliveryContext<'_>) {
-        self.touch(context.now);
+        self.note_seen(context.now);
         (self.waiting, self.presumed_lost, self.uses_network) = (None, false, true);
         if self.undelivered.note(sample) {
             context.budget.evictions += 1;
@@ -300,11 +300,13 @@ impl Delivery {
     pub fn not_reassembled(&mut self, number: SequenceNumber, context: &mut DeliveryContext<'_>) {
         self.uses_network = true;
         let sequence = self.reception.sequence();
-        if !sequence.started() || number > sequence.next().saturating_add(REACH) {
+        if !sequence.started() || number > sequence.next().saturating_add(MAX_TRUSTED_JUMP) {
             return;
         }
         if self.loss_causes.resolve(number) {
-            self.split(context).2.explain(LossCause::Reassembly, number);
+            self.split(context)
+                .2
+                .set_cause(LossCause::Reassembly, number);
             return;
         }
         self.record_cause(number, LossCause::Reassembly, context);
@@ -313,7 +315,7 @@ impl Delivery {
     /// Records a HEARTBEAT for this receiver. A delivery without samples begins with it. While no
     /// sample arrives and none is requested, the samples may use shared memory.
     pub fn heartbeat(&mut self, heartbeat: &Heartbeat, context: &mut DeliveryContext<'_>) {
-        self.touch(context.now);
+        self.note_seen(context.now);
         let end = heartbeat.last.next();
         self.reception.sequence_mut().begin(end);
         if !self.uses_network {
@@ -325,12 +327,12 @@ impl Delivery {
         reception.heartbeat(heartbeat, budget, &mut |decision| {
             accounting.take(decision);
         });
-        self.excuse_unheard(before);
+        self.mark_unread_irrelevant(before);
     }
 
     /// Records a GAP for this receiver.
     pub fn gap(&mut self, gap: &Gap, context: &mut DeliveryContext<'_>) {
-        self.touch(context.now);
+        self.note_seen(context.now);
         let (reception, budget, mut accounting) = self.split(context);
         reception.gap(gap, budget, &mut |decision| accounting.take(decision));
     }
@@ -378,7 +380,7 @@ impl Delivery {
         // Long runs are not caused by single fragments, and no retransmission repairs them.
         let (long, short): (Vec<_>, Vec<_>) = runs
             .into_iter()
-            .partition(|(first, last)| *last - *first > LONG_RUN);
+            .partition(|(first, last)| *last - *first > MIN_LONG_RUN);
         let pending: BTreeSet<SequenceNumber> = short
             .into_iter()
             .flat_map(|(first, last)| first.until(last.next()))
@@ -398,7 +400,7 @@ impl Delivery {
         let settled = other.reception.sequence().settled();
         let (reception, budget, mut accounting) = self.split(context);
         for (first, last) in long {
-            accounting.lose(LossCause::BeforeHost, first, last);
+            accounting.add_loss(LossCause::BeforeHost, first, last);
         }
         for number in pending {
             accounting.wait(number, number);
@@ -417,14 +419,14 @@ impl Delivery {
 
     /// Returns how many remembered samples have arrived both here and at `other`.
     #[must_use]
-    pub fn common_with(&self, other: &Self) -> u64 {
+    pub fn count_common(&self, other: &Self) -> u64 {
         let sequence = self.reception.sequence();
-        sequence.common_with(other.reception.sequence())
+        sequence.count_common(other.reception.sequence())
     }
 
     /// Counts this many messages as duplicates, because another delivery of the same receiver
     /// contains them.
-    pub fn drop_common(&mut self, common: u64, context: &mut DeliveryContext<'_>) {
+    pub fn count_common_as_duplicates(&mut self, common: u64, context: &mut DeliveryContext<'_>) {
         let tally = &mut self.tally;
         let common = common.min(tally.messages);
         if common == 0 {
@@ -458,7 +460,7 @@ impl Delivery {
         context.reliable && !self.best_effort
     }
 
-    fn touch(&mut self, now: ModelTime) {
+    fn note_seen(&mut self, now: ModelTime) {
         self.last_seen = self.last_seen.max(now);
     }
 
@@ -468,12 +470,12 @@ impl Delivery {
         context: &mut DeliveryContext<'_>,
     ) -> (bool, Option<CompleteSample>) {
         let (number, reliable) = (sample.sequence_number, self.is_reliable(context));
-        self.begin_anew(number, context);
+        self.restart(number, context);
         let sequence = self.reception.sequence();
         let is_sent = self.direction() == Direction::Sent;
         let source = sample.source_timestamp.timestamp();
-        let is_late = self.misses(number) && number < sequence.settled();
-        if !is_sent && is_late && !sequence.is_unconfirmed(number, source, REACH) {
+        let is_late = self.is_missing(number) && number < sequence.settled();
+        if !is_sent && is_late && !sequence.is_unconfirmed(number, source, MAX_TRUSTED_JUMP) {
             return self.late(sample, context);
         }
         let before = (sequence.next(), sequence.last_advance());
@@ -481,7 +483,7 @@ impl Delivery {
         let outcome = reception.sample(sample, reliable, budget, &mut |decision| {
             accounting.take(decision);
         });
-        self.excuse_unheard(before);
+        self.mark_unread_irrelevant(before);
         match outcome {
             Outcome::Open => (false, None),
             Outcome::Duplicate => {
@@ -534,8 +536,8 @@ impl Delivery {
         }
     }
 
-    /// Handles a sample that arrives after it was settled as lost. A whole sample whose loss cause is
-    /// still pending counts as recovered. Any other sample counts as a duplicate.
+    /// Handles a sample that arrives after it was settled as lost. A whole sample whose loss cause
+    /// is still pending counts as recovered. Any other sample counts as a duplicate.
     fn late(
         &mut self,
         sample: &Sample,
@@ -561,9 +563,9 @@ impl Delivery {
     }
 
     /// Restarts the delivery after a long range of numbers that were not for this receiver.
-    fn begin_anew(&mut self, number: SequenceNumber, context: &mut DeliveryContext<'_>) {
+    fn restart(&mut self, number: SequenceNumber, context: &mut DeliveryContext<'_>) {
         let sequence = self.reception.sequence();
-        let is_far = number.steps_since(sequence.next()) > EXCUSED;
+        let is_far = number.steps_since(sequence.next()) > MAX_IRRELEVANT_AT_START;
         if sequence.started() && is_far && sequence.last_advance() < self.opened {
             let (reception, budget, mut accounting) = self.split(context);
             reception.settle(budget, &mut |decision| accounting.take(decision));
@@ -619,7 +621,7 @@ impl Delivery {
         let window = settle_window(self.is_reliable(context));
         let until = context
             .reassembled
-            .then(|| context.now + REASSEMBLY.saturating_sub(window));
+            .then(|| context.now + REASSEMBLY_TIMEOUT.saturating_sub(window));
         let accounting = Accounting {
             tally: &mut self.tally,
             loss_causes: &mut self.loss_causes,

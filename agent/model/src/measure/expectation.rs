@@ -1,21 +1,22 @@
 //! Evaluates the expectations of watchlist entries on their topics.
 //!
 //! Evaluation takes place once per second of the source's clock. A topic becomes violated after
-//! `BAD` bad evaluations in a row and recovers after `GOOD` good ones. Rates are evaluated over a
-//! window of at least three expected messages (1 to 10 s), or over the window of the entry. One
-//! message of tolerance at the window's edges keeps a healthy periodic topic stable. Silence has
-//! its own time and no hysteresis. A silence between two messages, which ended before it was
-//! evaluated, violates at once, and recovers as the others do. The end of a window counts for `min_rate_hz` only as far as its
-//! messages are known. The messages of a sampled topic are known once polling sees the next one.
+//! `BAD` bad evaluations in a row and recovers after `EVALUATIONS_TO_RECOVER` good ones. Rates are
+//! evaluated over a window of at least three expected messages (1 to 10 s), or over the window of
+//! the entry. One message of tolerance at the window's edges keeps a healthy periodic topic stable.
+//! Silence has its own time and no hysteresis. A silence between two messages, which ended before
+//! it was evaluated, violates at once, and recovers as the others do. The end of a window counts
+//! for `min_rate_hz` only as far as its messages are known. The messages of a sampled topic are
+//! known once polling sees the next one.
 //!
 //! Windows and silences begin at the earliest when the agent can see the messages. That is after
 //! its own start, the first publisher or subscriber, and a time in which the source saw nothing. A
 //! topic that was silent before such a time stays silent until its next message.
 //!
-//! The numbers of publishers and subscribers are evaluated once `GRACE` has passed since the first
-//! publisher appeared, because a robot needs time to start. A writer without a reader mostly sends
-//! nothing. A quiet topic without a subscriber therefore violates neither `min_rate_hz` nor
-//! `max_silence_s`, but it may violate `publishers` and `subscribers`.
+//! The numbers of publishers and subscribers are evaluated once `STARTUP_GRACE_SECONDS` has passed
+//! since the first publisher appeared, because a robot needs time to start. A writer without a
+//! reader mostly sends nothing. A quiet topic without a subscriber therefore violates neither
+//! `min_rate_hz` nor `max_silence_s`, but it may violate `publishers` and `subscribers`.
 
 use std::time::Duration;
 
@@ -27,14 +28,14 @@ use crate::facts::rate::{SECONDS, Slot};
 use crate::facts::watch::{Expectations, WatchState};
 
 /// Number of bad evaluations in a row after which a topic is violated.
-const BAD: u8 = 2;
+const EVALUATIONS_TO_VIOLATE: u8 = 2;
 /// Number of good evaluations in a row after which a violated topic recovers.
-const GOOD: u8 = 3;
+const EVALUATIONS_TO_RECOVER: u8 = 3;
 /// Number of evaluations after a silence in which its end is no silence of its own.
-const SILENCE_ENDS: u8 = 2;
+const SILENCE_END_EVALUATIONS: u8 = 2;
 /// Seconds from a topic's first publisher until the numbers of its endpoints are evaluated.
-pub const GRACE: u64 = 10;
-const NAMES: [&str; 7] = [
+pub const STARTUP_GRACE_SECONDS: u64 = 10;
+const EXPECTATION_NAMES: [&str; 7] = [
     "min_rate_hz",
     "max_rate_hz",
     "max_loss_ratio",
@@ -63,7 +64,7 @@ pub struct Evidence<'a> {
     pub last_message: Option<ModelTime>,
     /// Returns how long the topic may seem silent while messages are sent. The argument is their
     /// interval if it is not known.
-    pub seeming_silence: &'a dyn Fn(Duration) -> Duration,
+    pub max_unseen_time: &'a dyn Fn(Duration) -> Duration,
     /// Time at which the topic became both published and watched.
     pub since: ModelTime,
     /// Time at which messages became expected and visible; at least `since`.
@@ -77,12 +78,12 @@ pub struct Evidence<'a> {
 
 /// State of one topic under one watchlist entry.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Judgement {
+pub struct TopicEvaluation {
     /// Whether no evaluation has taken place.
     fresh: bool,
     state: WatchState,
     violated: bool,
-    broken: u8,
+    violated_bits: u8,
     bad: u8,
     good: u8,
     /// Evaluations until an interval counts again after a silence.
@@ -108,7 +109,7 @@ impl Evidence<'_> {
     /// expected at `rate`.
     fn unknown_seconds(&self, rate: f64) -> f64 {
         let interval = Duration::try_from_secs_f64(1.0 / rate).unwrap_or(Duration::MAX);
-        let seeming = (self.seeming_silence)(interval);
+        let seeming = (self.max_unseen_time)(interval);
         let last = self.last_message.unwrap_or_default().max(self.observed);
         if seeming.is_zero() || self.now - last > seeming {
             return 0.0;
@@ -118,13 +119,13 @@ impl Evidence<'_> {
     }
 }
 
-impl Default for Judgement {
+impl Default for TopicEvaluation {
     fn default() -> Self {
         Self {
             fresh: true,
             state: WatchState::Ok,
             violated: false,
-            broken: 0,
+            violated_bits: 0,
             bad: 0,
             good: 0,
             ending: 0,
@@ -132,7 +133,7 @@ impl Default for Judgement {
     }
 }
 
-impl Judgement {
+impl TopicEvaluation {
     /// Returns the state.
     #[must_use]
     pub const fn state(&self) -> WatchState {
@@ -142,15 +143,15 @@ impl Judgement {
     /// Returns the keys of the violated expectations.
     #[must_use]
     pub fn violations(&self) -> Vec<&'static str> {
-        let broken = |bit: &usize| self.broken & 1 << bit != 0;
-        (0..NAMES.len())
+        let broken = |bit: &usize| self.violated_bits & 1 << bit != 0;
+        (0..EXPECTATION_NAMES.len())
             .filter(broken)
-            .filter_map(|bit| NAMES.get(bit).copied())
+            .filter_map(|bit| EXPECTATION_NAMES.get(bit).copied())
             .collect()
     }
 
-    /// Evaluates the topic. Returns the previous state if the state changed; it is `None` at the first
-    /// evaluation, at which any state but `Ok` counts as a change.
+    /// Evaluates the topic. Returns the previous state if the state changed; it is `None` at the
+    /// first evaluation, at which any state but `Ok` counts as a change.
     pub fn judge(
         &mut self,
         expectations: &Expectations,
@@ -158,9 +159,9 @@ impl Judgement {
     ) -> Option<Option<WatchState>> {
         let before = (!self.fresh).then_some(self.state);
         let is_silent = self.state == WatchState::Silent;
-        let broken = broken(expectations, evidence, is_silent);
+        let broken = violated_bits(expectations, evidence, is_silent);
         let quiet = broken & MAX_SILENCE != 0 || evidence.last_message.is_none();
-        let broken = without_consequences(broken, quiet, evidence);
+        let broken = without_subscriber_effects(broken, quiet, evidence);
         let silent = broken & MAX_SILENCE != 0;
         let has_gap = !silent
             && self.ending == 0
@@ -169,7 +170,7 @@ impl Judgement {
                 .max_silence
                 .is_some_and(|maximum| evidence.has_gap(maximum));
         self.ending = match silent {
-            true => SILENCE_ENDS,
+            true => SILENCE_END_EVALUATIONS,
             false => self.ending.saturating_sub(1),
         };
         if broken & !MAX_SILENCE == 0 && !has_gap {
@@ -182,9 +183,9 @@ impl Judgement {
         } else {
             broken
         };
-        if self.bad >= BAD || has_gap {
+        if self.bad >= EVALUATIONS_TO_VIOLATE || has_gap {
             self.violated = true;
-        } else if self.good >= GOOD {
+        } else if self.good >= EVALUATIONS_TO_RECOVER {
             self.violated = false;
         }
         let lacks_endpoints = self.violated && broken & (PUBLISHERS | SUBSCRIBERS) != 0;
@@ -200,12 +201,12 @@ impl Judgement {
             WatchState::Ok
         };
         match self.state {
-            WatchState::Silent => self.broken = broken,
+            WatchState::Silent => self.violated_bits = broken,
             // In a violated state without a currently violated expectation, the last ones stay
             // listed.
-            WatchState::Violated if broken != 0 => self.broken = broken,
+            WatchState::Violated if broken != 0 => self.violated_bits = broken,
             WatchState::Violated => {}
-            _ => self.broken = 0,
+            _ => self.violated_bits = 0,
         }
         self.fresh = false;
         (before.unwrap_or(WatchState::Ok) != self.state).then_some(before)
@@ -216,7 +217,7 @@ impl Judgement {
     clippy::cast_precision_loss,
     reason = "counts of ten seconds are far below 2^52"
 )]
-fn broken(expectations: &Expectations, evidence: &Evidence<'_>, is_silent: bool) -> u8 {
+fn violated_bits(expectations: &Expectations, evidence: &Evidence<'_>, is_silent: bool) -> u8 {
     let mut broken = 0;
     let rates = |rate: f64| {
         let window = expectations
@@ -254,11 +255,11 @@ fn broken(expectations: &Expectations, evidence: &Evidence<'_>, is_silent: bool)
             true => last,
             false => last.max(evidence.observed),
         };
-        if evidence.now - begin > maximum.max((evidence.seeming_silence)(maximum)) {
+        if evidence.now - begin > maximum.max((evidence.max_unseen_time)(maximum)) {
             broken |= MAX_SILENCE;
         }
     }
-    if evidence.now - evidence.since >= Duration::from_secs(GRACE) {
+    if evidence.now - evidence.since >= Duration::from_secs(STARTUP_GRACE_SECONDS) {
         let lacks = |expected: Option<u32>, there: usize| {
             expected.is_some_and(|expected| there < usize::try_from(expected).unwrap_or(usize::MAX))
         };
@@ -273,7 +274,7 @@ fn broken(expectations: &Expectations, evidence: &Evidence<'_>, is_silent: bool)
 }
 
 /// Removes the violations that follow from the absence of all subscribers.
-const fn without_consequences(broken: u8, quiet: bool, evidence: &Evidence<'_>) -> u8 {
+const fn without_subscriber_effects(broken: u8, quiet: bool, evidence: &Evidence<'_>) -> u8 {
     let is_expected = broken & SUBSCRIBERS != 0;
     if evidence.subscriptions == 0 && (quiet || is_expected) {
         broken & !(MIN_RATE | MAX_SILENCE)
@@ -296,7 +297,7 @@ mod tests {
     use super::*;
 
     struct Bench {
-        judgement: Judgement,
+        judgement: TopicEvaluation,
         expectations: Expectations,
         now: u64,
         last_message: Option<ModelTime>,
@@ -311,7 +312,7 @@ mod tests {
     impl Bench {
         fn new(expectations: Expectations) -> Self {
             Self {
-                judgement: Judgement::default(),
+                judgement: TopicEvaluation::default(),
                 expectations,
                 now: 1000 * SECOND,
                 last_message: None,
@@ -342,7 +343,7 @@ mod tests {
                     publishers: self.publishers,
                     subscriptions: self.subscriptions,
                     last_message: self.last_message,
-                    seeming_silence: &|_| self.seeming_silence,
+                    max_unseen_time: &|_| self.seeming_silence,
                     since: ModelTime::from_nanoseconds(1000 * SECOND),
                     observed: self.observed,
                     recent: &recent,
@@ -404,7 +405,7 @@ mod tests {
     }
 
     #[test]
-    fn an_interval_from_before_the_messages_were_expected_is_no_gap() {
+    fn an_interval_that_began_before_messages_were_expected_is_not_a_gap() {
         let mut bench = without_silence_above(0.2);
         assert_eq!(bench.second(gap(60.0)), WatchState::Ok);
         assert_eq!(bench.second(gap(0.1)), WatchState::Ok);
@@ -413,7 +414,7 @@ mod tests {
     }
 
     #[test]
-    fn the_end_of_a_silence_is_no_second_violation() {
+    fn the_end_of_a_silence_is_not_a_second_violation() {
         let mut bench = without_silence_above(1.5);
         for messages in [10, 10, 10, 0, 0] {
             bench.second(rate(messages));
@@ -575,7 +576,7 @@ mod tests {
         });
         bench.publishers = publishers.map_or(1, |count| count as usize);
         bench.subscriptions = subscribers.map_or(1, |count| count as usize);
-        for _ in 0..GRACE {
+        for _ in 0..STARTUP_GRACE_SECONDS {
             assert_eq!(bench.second(rate(10)), WatchState::Ok);
         }
         bench
@@ -623,7 +624,7 @@ mod tests {
         });
         bench.subscriptions = 0;
         bench.publishers = 2;
-        for _ in 0..=GRACE {
+        for _ in 0..=STARTUP_GRACE_SECONDS {
             assert_eq!(bench.second(rate(0)), WatchState::NoSubscriber);
         }
         bench.publishers = 1;
@@ -640,7 +641,7 @@ mod tests {
             ..Expectations::default()
         });
         bench.subscriptions = 0;
-        for _ in 0..GRACE {
+        for _ in 0..STARTUP_GRACE_SECONDS {
             assert_eq!(bench.second(rate(0)), WatchState::NoSubscriber);
         }
         assert_eq!(bench.second(rate(0)), WatchState::Violated);

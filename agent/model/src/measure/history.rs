@@ -21,7 +21,7 @@ use crate::facts::tables::{HistoryRows, HistorySeconds, HistoryTotals};
 
 /// Maximum number of names, as a multiple of the measured topics. Topics that are no longer
 /// measured keep their names within it.
-const NAMES: usize = 2;
+const MAX_NAMES_PER_TOPIC: usize = 2;
 
 /// A ring of the last seconds.
 #[derive(Debug)]
@@ -106,7 +106,7 @@ impl History {
     /// measured simultaneously.
     #[must_use]
     pub fn new(span: Duration, topics: usize) -> Self {
-        let most = topics.saturating_mul(NAMES);
+        let most = topics.saturating_mul(MAX_NAMES_PER_TOPIC);
         Self {
             most,
             seconds: Bounded::capped(usize::try_from(span.as_secs()).unwrap_or(usize::MAX)),

@@ -5,8 +5,8 @@
 //! retransmission, a GAP or HEARTBEAT of the writer, ACKNACKs of the readers, or the decision about
 //! a loss closes it. The time of the sample is then the time at which the gap closed. The waiting
 //! samples are bounded in number, bytes and time. Beyond these bounds they are dispatched, and a
-//! late retransmission follows out of order. Otherwise samples wait only after a gap, for a reliable
-//! reader on this host: ACKNACKs of readers on other hosts are not seen.
+//! late retransmission follows out of order. Otherwise samples wait only after a gap, for a
+//! reliable reader on this host: ACKNACKs of readers on other hosts are not seen.
 //!
 //! Samples of every writer also wait while uprobes take over from polling: the last message that
 //! both views may have seen can arrive after later ones. The readers do not wait for it, so these
@@ -29,7 +29,7 @@ const GAP_TIMEOUT: Duration = Duration::from_secs(4);
 /// Samples from before the announcement are retransmitted within this time, or not at all.
 const RETRANSMISSION_TIMEOUT: Duration = Duration::from_secs(10);
 /// Memory per sample in addition to its payload, in bytes.
-const OVERHEAD: usize = size_of::<QueuedSample>() + 64;
+const SAMPLE_OVERHEAD: usize = size_of::<QueuedSample>() + 64;
 /// Maximum time from the announcement to the first ACKNACK.
 const FIRST_ACKNACK_TIMEOUT: Duration = Duration::from_secs(1);
 
@@ -89,7 +89,7 @@ impl QueuedSample {
 
     /// Returns the memory that it needs while it waits.
     pub fn cost(&self) -> usize {
-        OVERHEAD + self.bytes()
+        SAMPLE_OVERHEAD + self.bytes()
     }
 }
 
@@ -120,7 +120,7 @@ impl InOrder {
 
     /// Returns whether this sample was counted before the announcement and is not dispatched yet.
     #[must_use]
-    pub fn lacks(&self, number: SequenceNumber) -> bool {
+    pub fn is_undispatched(&self, number: SequenceNumber) -> bool {
         self.earlier.contains(&number)
     }
 
@@ -136,7 +136,7 @@ impl InOrder {
         if previous == Some(incarnation) {
             return false;
         }
-        self.give_all(now, give);
+        self.dispatch_all(now, give);
         previous.is_some()
     }
 
@@ -159,7 +159,7 @@ impl InOrder {
     }
 
     /// Removes and returns the samples from before the announcement that will not be retransmitted.
-    pub fn forgone(&mut self, progress: &Progress, now: ModelTime) -> Vec<SequenceNumber> {
+    pub fn take_expired(&mut self, progress: &Progress, now: ModelTime) -> Vec<SequenceNumber> {
         if self.earlier.is_empty() {
             return Vec::new();
         }
@@ -189,7 +189,7 @@ impl InOrder {
             && *entry.key() < complete
         {
             let queued = entry.remove();
-            self.give(queued, now, give);
+            self.dispatch(queued, now, give);
         }
         if self.waiting.is_empty() {
             return None;
@@ -201,20 +201,25 @@ impl InOrder {
         let is_late = self.hole.1 + GAP_TIMEOUT <= now;
         if is_late || self.waiting.is_full() || self.bytes > room {
             let last = self.waiting.last_key_value().map(|(number, _)| *number);
-            self.give_all(now, give);
+            self.dispatch_all(now, give);
             return last.map(|last| last.next());
         }
         None
     }
 
     /// Dispatches all waiting samples.
-    pub fn give_all(&mut self, now: ModelTime, give: &mut impl FnMut(QueuedSample)) {
+    pub fn dispatch_all(&mut self, now: ModelTime, give: &mut impl FnMut(QueuedSample)) {
         while let Some((_, queued)) = self.waiting.pop_first() {
-            self.give(queued, now, give);
+            self.dispatch(queued, now, give);
         }
     }
 
-    fn give(&mut self, queued: QueuedSample, now: ModelTime, give: &mut impl FnMut(QueuedSample)) {
+    fn dispatch(
+        &mut self,
+        queued: QueuedSample,
+        now: ModelTime,
+        give: &mut impl FnMut(QueuedSample),
+    ) {
         self.bytes -= queued.cost();
         let came = queued.sample.time;
         // The reader may have received the lower number through unobserved shared memory. This

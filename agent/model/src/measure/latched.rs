@@ -41,7 +41,7 @@ pub const MESSAGE_BYTES: usize = 1 << 20;
 /// Maximum size of all unfinished messages, in bytes.
 const ASSEMBLY_BYTES: usize = 4 << 20;
 /// Bytes of one writer that may be captured in a burst, and per second.
-const WRITER: Allowance = Allowance::new(8 << 20, 16 << 10);
+const WRITER_ALLOWANCE: Allowance = Allowance::new(8 << 20, 16 << 10);
 /// Bytes of all writers that may be captured in a burst, and per second.
 const ALL_WRITERS: Allowance = Allowance::new(64 << 20, 256 << 10);
 /// A paused writer is captured again once it is allowed this many bytes: a whole message.
@@ -69,16 +69,16 @@ pub struct LatchedTopic {
 
 #[derive(Debug)]
 struct LatchedWriter {
-    about: LatchedTopic,
+    topic: LatchedTopic,
     allowance: WriterAllowance,
     /// Number and source timestamp of the last message.
     newest: Option<(SequenceNumber, Option<Timestamp>)>,
-    last: Last,
+    last: LastMessage,
 }
 
 /// The last message of a writer.
 #[derive(Debug)]
-enum Last {
+enum LastMessage {
     /// No complete message was seen.
     Unseen,
     /// The message, and the time of its arrival.
@@ -104,27 +104,27 @@ impl Latched {
     /// Begins to keep the last message of this writer, unless the table of writers is full.
     pub fn follow(&mut self, writer: Guid, about: LatchedTopic) {
         let new = || LatchedWriter {
-            about: about.clone(),
-            allowance: WriterAllowance::new(WRITER),
+            topic: about.clone(),
+            allowance: WriterAllowance::new(WRITER_ALLOWANCE),
             newest: None,
-            last: Last::Unseen,
+            last: LastMessage::Unseen,
         };
         let Some(known) = self.writers.get_or_insert_with(writer, new) else {
             return;
         };
-        known.about = about;
+        known.topic = about;
         // A message that was kept for a watch may be too large without the watch.
-        if let Last::Kept(sample, _) = &known.last
+        if let LastMessage::Kept(sample, _) = &known.last
             && size(sample) > known.most()
         {
-            let last = Last::TooLarge(sized(size(sample)));
+            let last = LastMessage::TooLarge(saturated_size(size(sample)));
             self.replace(writer, last);
         }
     }
 
     /// Drops a writer and its message.
     pub fn forget(&mut self, writer: Guid) {
-        self.replace(writer, Last::Unseen);
+        self.replace(writer, LastMessage::Unseen);
         if let Some(known) = self.writers.remove(&writer) {
             self.allowance.forget(&known.allowance);
             self.assembly.release(writer);
@@ -178,14 +178,14 @@ impl Latched {
         }
         let number = sample.sequence_number;
         let source = sample.source_timestamp.timestamp();
-        if !known.lacks((number, source)) {
+        if !known.is_newer_or_incomplete((number, source)) {
             return false;
         }
         if known.newest.is_none_or(|(newest, _)| newest != number) {
             known.newest = Some((number, source));
             self.assembly.release(writer);
             // The kept message is no longer the last.
-            self.replace(writer, Last::Unseen);
+            self.replace(writer, LastMessage::Unseen);
         }
         self.assembly.put(sample, payload, 0);
         if !self.assembly.is_whole(writer, number) {
@@ -196,9 +196,9 @@ impl Latched {
             return false;
         };
         let is_whole = matches!(sample.content, Content::Data { .. });
-        let has_stamp = known.about.has_header && is_whole;
+        let has_stamp = known.topic.has_header && is_whole;
         let sample = Sample {
-            topic: Arc::clone(&known.about.topic),
+            topic: Arc::clone(&known.topic.topic),
             time: wall_clock.wall_time(now),
             writer,
             sequence_number: number,
@@ -218,13 +218,13 @@ impl Latched {
             return;
         };
         let about = (sample.sequence_number, sample.source_timestamp);
-        if sample.payload.is_none() || !known.lacks(about) {
+        if sample.payload.is_none() || !known.is_newer_or_incomplete(about) {
             return;
         }
         known.newest = Some(about);
         self.assembly.release(sample.writer);
         if size(sample) > known.most() {
-            let last = Last::TooLarge(sized(size(sample)));
+            let last = LastMessage::TooLarge(saturated_size(size(sample)));
             self.replace(sample.writer, last);
         } else {
             self.keep(Arc::clone(sample), at);
@@ -258,14 +258,14 @@ impl Latched {
         };
         let source = sample.source_timestamp.timestamp();
         let about = (sample.sequence_number, source);
-        if !known.lacks(about) {
+        if !known.is_newer_or_incomplete(about) {
             return;
         }
         known.newest = Some(about);
         let bytes = usize::try_from(sample.size()).unwrap_or(usize::MAX);
         let last = match bytes > known.most() {
-            true => Last::TooLarge(sample.size()),
-            false => Last::Paused,
+            true => LastMessage::TooLarge(sample.size()),
+            false => LastMessage::Paused,
         };
         self.replace(writer, last);
     }
@@ -283,7 +283,7 @@ impl Latched {
     #[must_use]
     pub fn samples(&self) -> Vec<(ModelTime, Arc<Sample>)> {
         let kept = self.writers.values().filter_map(|known| match &known.last {
-            Last::Kept(sample, at) => Some((*at, Arc::clone(sample))),
+            LastMessage::Kept(sample, at) => Some((*at, Arc::clone(sample))),
             _ => None,
         });
         let mut kept: Vec<_> = kept.collect();
@@ -296,11 +296,11 @@ impl Latched {
     pub fn facts(&self, writer: Guid) -> Option<LatchedFacts> {
         let known = self.writers.get(&writer)?;
         Some(match &known.last {
-            Last::Unseen => LatchedFacts::Unseen,
-            Last::Kept(sample, _) => LatchedFacts::Kept(sized(size(sample))),
-            Last::TooLarge(bytes) => LatchedFacts::TooLarge(*bytes),
-            Last::Paused => LatchedFacts::Paused,
-            Last::NoRoom(bytes) => LatchedFacts::NoRoom(*bytes),
+            LastMessage::Unseen => LatchedFacts::Unseen,
+            LastMessage::Kept(sample, _) => LatchedFacts::Kept(saturated_size(size(sample))),
+            LastMessage::TooLarge(bytes) => LatchedFacts::TooLarge(*bytes),
+            LastMessage::Paused => LatchedFacts::Paused,
+            LastMessage::NoRoom(bytes) => LatchedFacts::NoRoom(*bytes),
         })
     }
 
@@ -326,18 +326,18 @@ impl Latched {
     /// Keeps a message, if the cap on bytes allows.
     fn keep(&mut self, sample: Arc<Sample>, at: ModelTime) {
         let (writer, bytes) = (sample.writer, size(&sample));
-        self.replace(writer, Last::Unseen);
+        self.replace(writer, LastMessage::Unseen);
         let known = self.writers.get(&writer);
-        let is_watched = known.is_some_and(|known| known.about.is_watched);
-        while bytes > self.bytes.room() {
+        let is_watched = known.is_some_and(|known| known.topic.is_watched);
+        while bytes > self.bytes.remaining() {
             self.bytes.refuse();
             let Some((other, size)) = self.largest(is_watched, (writer.prefix, bytes)) else {
-                self.replace(writer, Last::NoRoom(sized(bytes)));
+                self.replace(writer, LastMessage::NoRoom(saturated_size(bytes)));
                 return;
             };
-            self.replace(other, Last::NoRoom(sized(size)));
+            self.replace(other, LastMessage::NoRoom(saturated_size(size)));
         }
-        self.replace(writer, Last::Kept(sample, at));
+        self.replace(writer, LastMessage::Kept(sample, at));
     }
 
     /// Returns the writer whose message is dropped for a new one, and the size of that message. It
@@ -351,10 +351,10 @@ impl Latched {
     ) -> Option<(Guid, usize)> {
         let kept = || {
             self.writers.iter().filter_map(|(writer, known)| {
-                let Last::Kept(sample, at) = &known.last else {
+                let LastMessage::Kept(sample, at) = &known.last else {
                     return None;
                 };
-                (is_watched || !known.about.is_watched).then_some((writer, sample, *at))
+                (is_watched || !known.topic.is_watched).then_some((writer, sample, *at))
             })
         };
         let mut sums: HashMap<_, _> = HashMap::from_iter([(newcomer, bytes)]);
@@ -370,14 +370,14 @@ impl Latched {
     }
 
     /// Replaces the state of a writer's last message.
-    fn replace(&mut self, writer: Guid, last: Last) {
+    fn replace(&mut self, writer: Guid, last: LastMessage) {
         let Some(known) = self.writers.get_mut(&writer) else {
             return;
         };
-        if let Last::Kept(sample, _) = &last {
+        if let LastMessage::Kept(sample, _) = &last {
             self.bytes.add(size(sample));
         }
-        if let Last::Kept(sample, _) = std::mem::replace(&mut known.last, last) {
+        if let LastMessage::Kept(sample, _) = std::mem::replace(&mut known.last, last) {
             self.bytes.sub(size(&sample));
         }
     }
@@ -386,7 +386,7 @@ impl Latched {
 impl LatchedWriter {
     /// Returns the maximum size of a message to keep.
     const fn most(&self) -> usize {
-        match self.about.is_watched {
+        match self.topic.is_watched {
             true => RetainedBytes::CAP,
             false => MESSAGE_BYTES,
         }
@@ -394,9 +394,10 @@ impl LatchedWriter {
 
     /// Returns whether a message is later than the last one, or is the last one and was not
     /// captured completely.
-    fn lacks(&self, about: (SequenceNumber, Option<Timestamp>)) -> bool {
+    fn is_newer_or_incomplete(&self, about: (SequenceNumber, Option<Timestamp>)) -> bool {
         let is_last = self.newest.is_some_and(|(number, _)| number == about.0);
-        is_last && matches!(self.last, Last::Unseen | Last::Paused) || self.is_newer(about)
+        is_last && matches!(self.last, LastMessage::Unseen | LastMessage::Paused)
+            || self.is_newer(about)
     }
 
     /// Returns whether a message is later than the last one. A lower number is later only if its
@@ -416,6 +417,6 @@ fn size(sample: &Sample) -> usize {
     sample.payload.as_ref().map_or(0, bytes::Bytes::len)
 }
 
-fn sized(bytes: usize) -> u32 {
+fn saturated_size(bytes: usize) -> u32 {
     u32::try_from(bytes).unwrap_or(u32::MAX)
 }

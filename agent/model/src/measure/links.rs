@@ -1,5 +1,5 @@
-//! TCP connections to other hosts that carry RTPS or Zenoh: round trip times and retransmissions, as
-//! the kernel of the sender counts them. The connections between two addresses are one link.
+//! TCP connections to other hosts that carry RTPS or Zenoh: round trip times and retransmissions,
+//! as the kernel of the sender counts them. The connections between two addresses are one link.
 
 use std::collections::{BTreeMap, HashMap};
 use std::time::Duration;
@@ -14,20 +14,20 @@ use crate::facts::tables::{LinkConnections, TcpLinks};
 use crate::graph::zenoh::Flow;
 
 /// Number of seconds over which the share of retransmitted segments is measured.
-const WINDOW: usize = 10;
+const WINDOW_SECONDS: usize = 10;
 /// Time without a report after which a connection is forgotten: longer than the pause between two
 /// retransmissions, at most 120 s on Linux, and than that between two KEEP_ALIVEs.
-const SILENCE: Duration = Duration::from_secs(130);
+const MAX_SILENCE: Duration = Duration::from_secs(130);
 /// Time without a report after which a link is forgotten.
-const FORGOTTEN: Duration = Duration::from_secs(600);
-/// Segments of 1000 that are retransmitted: from the first number on the link is a finding, and below
-/// the second it is none any longer.
-const LOSSY: u64 = 20;
-const SOUND: u64 = 10;
+const LINK_TIMEOUT: Duration = Duration::from_secs(600);
+/// Segments of 1000 that are retransmitted: from the first number on the link is a finding, and
+/// below the second it is none any longer.
+const LOSSY_PERMILLE: u64 = 20;
+const RECOVERED_PERMILLE: u64 = 10;
 /// Minimum number of retransmitted segments of a finding.
-const FEW: u64 = 5;
+const MIN_RETRANSMITTED: u64 = 5;
 /// Number of seconds in which a link of a finding has sent new segments.
-const PROGRESS: usize = 3;
+const PROGRESS_SECONDS: usize = 3;
 
 /// A report about one connection.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
@@ -80,7 +80,7 @@ struct Link {
     sent: u64,
     retransmitted: u64,
     /// Sent and retransmitted segments of the last seconds; the last slot is the current second.
-    recent: [(u64, u64); WINDOW],
+    recent: [(u64, u64); WINDOW_SECONDS],
     is_lossy: bool,
 }
 
@@ -88,18 +88,20 @@ impl Link {
     /// Returns how many of 1000 segments were retransmitted lately.
     fn permille(&self) -> u64 {
         let sent: u64 = self.recent.iter().map(|(sent, _)| sent).sum();
-        (self.again() * 1000).checked_div(sent).unwrap_or(0)
+        (self.recent_retransmissions() * 1000)
+            .checked_div(sent)
+            .unwrap_or(0)
     }
 
     /// Returns whether new segments were sent in the last seconds. A peer that is gone acknowledges
     /// nothing, and then TCP only retransmits.
     fn makes_progress(&self) -> bool {
-        let last = self.recent.iter().rev().take(PROGRESS);
+        let last = self.recent.iter().rev().take(PROGRESS_SECONDS);
         last.fold(0, |new, (sent, again)| new + sent.saturating_sub(*again)) > 0
     }
 
     /// Returns the number of segments that were retransmitted lately.
-    fn again(&self) -> u64 {
+    fn recent_retransmissions(&self) -> u64 {
         self.recent.iter().map(|(_, again)| again).sum()
     }
 }
@@ -148,13 +150,18 @@ impl Links {
 
     /// Ends a second: determines which links are lossy, and forgets what is gone.
     pub fn end_second(&mut self, now: ModelTime) {
-        self.connections.retain(|_, each| each.at + SILENCE > now);
-        self.links.retain(|_, each| each.at + FORGOTTEN > now);
+        self.connections
+            .retain(|_, each| each.at + MAX_SILENCE > now);
+        self.links.retain(|_, each| each.at + LINK_TIMEOUT > now);
         for link in self.links.values_mut() {
             let share = link.permille();
             let is_lossy = match link.is_lossy {
-                true => share >= SOUND,
-                false => share >= LOSSY && link.again() >= FEW && link.makes_progress(),
+                true => share >= RECOVERED_PERMILLE,
+                false => {
+                    share >= LOSSY_PERMILLE
+                        && link.recent_retransmissions() >= MIN_RETRANSMITTED
+                        && link.makes_progress()
+                }
             };
             self.revision += u64::from(is_lossy != link.is_lossy);
             link.is_lossy = is_lossy;
@@ -286,7 +293,7 @@ mod tests {
     }
 
     #[test]
-    fn a_peer_that_is_gone_is_no_lossy_link() {
+    fn a_removed_peer_is_not_a_lossy_link() {
         let mut links = Links::default();
         let (mut sent, mut again) = (0, 0);
         for second in 0..60 {

@@ -15,7 +15,7 @@ use crate::facts::model_time::ModelTime;
 use crate::facts::tables::{KnownLosses, OpenLosses};
 
 /// By default, the kernel waits 30 s for IP fragments (`net.ipv4.ipfrag_time`).
-pub const REASSEMBLY: Duration = Duration::from_secs(35);
+pub const REASSEMBLY_TIMEOUT: Duration = Duration::from_secs(35);
 
 /// Known causes and pending losses.
 #[derive(Debug, Default)]
@@ -50,7 +50,7 @@ impl LossCauses {
         self.known.insert(number, KnownLoss { cause, at }).is_some()
     }
 
-    /// Removes and returns the known loss of a sample that arrived after all or was excused.
+    /// Removes and returns the known loss of a sample that arrived after all or became irrelevant.
     pub fn forget(&mut self, number: SequenceNumber) -> Option<KnownLoss> {
         if self.known.is_empty() {
             return None;
@@ -58,8 +58,8 @@ impl LossCauses {
         self.known.remove(&number)
     }
 
-    /// Removes the known causes of `first..=last`. Visits each number with a known cause alone, and the
-    /// others as runs without a cause.
+    /// Removes the known causes of `first..=last`. Visits each number with a known cause alone, and
+    /// the others as runs without a cause.
     pub fn explain(
         &mut self,
         first: SequenceNumber,

@@ -104,25 +104,25 @@ impl Payloads {
 
     /// Returns whether payloads of any writer are requested.
     #[must_use]
-    pub const fn wants_any_bytes(&self) -> bool {
+    pub const fn needs_any_payload(&self) -> bool {
         self.deep > 0
     }
 
     /// Returns whether payloads of this writer are requested.
     #[must_use]
-    pub fn wants_bytes(&self, writer: Guid) -> bool {
+    pub fn needs_payload(&self, writer: Guid) -> bool {
         let is_deep = |interested: &WantedWriter| !interested.payloads.is_empty();
         self.deep > 0 && self.writers.get(&writer).is_some_and(is_deep)
     }
 
     /// Returns the writers whose samples are requested.
-    pub fn wanted(&self) -> impl Iterator<Item = &Guid> {
+    pub fn requested_writers(&self) -> impl Iterator<Item = &Guid> {
         self.writers.keys()
     }
 
     /// Returns whether any writer's samples are dispatched for this request.
     #[must_use]
-    pub fn serves(&self, request: u64) -> bool {
+    pub fn has_request(&self, request: u64) -> bool {
         self.writers
             .values()
             .any(|known| known.to.contains(&request))
@@ -130,7 +130,7 @@ impl Payloads {
 
     /// Begins to dispatch the samples of this writer at `now`; the next sample has the number
     /// `next`, or is the first one. `is_new`: the requests are older than the writer.
-    pub fn want(
+    pub fn start_writer(
         &mut self,
         writer: Guid,
         topic: Topic,
@@ -182,7 +182,7 @@ impl Payloads {
     /// Dispatches the waiting samples of this writer, and then stops dispatching its samples.
     pub fn release(&mut self, writer: Guid, now: ModelTime) {
         self.unknown_writers.remove(&writer);
-        self.give_all(writer, now);
+        self.dispatch_all(writer, now);
         let before = self.writers.remove(&writer);
         if before.is_some_and(|before| !before.payloads.is_empty()) {
             self.deep -= 1;
@@ -198,11 +198,11 @@ impl Payloads {
 
     /// Returns whether samples of this writer are requested.
     #[must_use]
-    pub fn wants(&self, writer: Guid) -> bool {
+    pub fn is_requested(&self, writer: Guid) -> bool {
         self.writers.contains_key(&writer)
     }
 
-    /// Dispatches a counted sample. Returns the same as [`Self::turn`].
+    /// Dispatches a counted sample. Returns the same as [`Self::dispatch_ready`].
     pub fn counted(
         &mut self,
         writer: Guid,
@@ -237,7 +237,7 @@ impl Payloads {
         let is_known = is_complete && !counted.unconfirmed;
         let to = interested.without(to, |begin| {
             begin.before == Some(counted.number) && !counted.unconfirmed
-                || is_known && begin.begins_after(counted.number)
+                || is_known && begin.starts_after(counted.number)
         });
         for begin in &mut interested.begins {
             begin.concerns(&to, counted.number);
@@ -265,21 +265,17 @@ impl Payloads {
         if counted.unconfirmed || is_complete {
             let queued = order.pass(queued, counted.at);
             before.push(queued);
-            before
-                .into_iter()
-                .for_each(|queued| self.give_queued(queued));
+            before.into_iter().for_each(|queued| self.enqueue(queued));
             return None;
         }
         order.put(queued);
-        before
-            .into_iter()
-            .for_each(|queued| self.give_queued(queued));
-        self.turn(writer, progress, counted.at)
+        before.into_iter().for_each(|queued| self.enqueue(queued));
+        self.dispatch_ready(writer, progress, counted.at)
     }
 
     /// Returns whether a request receives this sample from before its start. The sample is then not
     /// dispatched when the writer repeats it. A recent sample may already have been dispatched.
-    pub fn give_before(
+    pub fn dispatch_latched(
         &mut self,
         writer: Guid,
         (id, number): (u64, SequenceNumber),
@@ -298,15 +294,15 @@ impl Payloads {
     }
 
     /// Dispatches a retransmitted sample from before the announcement. Returns the same as
-    /// [`Self::turn`].
-    pub fn came_again(
+    /// [`Self::dispatch_ready`].
+    pub fn dispatch_retransmitted(
         &mut self,
         writer: Guid,
         counted: &Counted,
         progress: &Progress,
     ) -> Option<SequenceNumber> {
         let is_whole = self.assembly.is_whole(writer, counted.number);
-        if self.wants_bytes(writer) && !is_whole {
+        if self.needs_payload(writer) && !is_whole {
             return None;
         }
         self.counted(writer, counted, progress)
@@ -315,13 +311,13 @@ impl Payloads {
     /// Returns whether this sample was counted before its writer's announcement and is dispatched
     /// if it is retransmitted.
     #[must_use]
-    pub fn lacks(&self, writer: Guid, number: SequenceNumber) -> bool {
+    pub fn is_undispatched(&self, writer: Guid, number: SequenceNumber) -> bool {
         let interested = self.writers.get(&writer);
-        interested.is_some_and(|interested| interested.order.lacks(number))
+        interested.is_some_and(|interested| interested.order.is_undispatched(number))
     }
 
     /// Records a counted sample of a writer without an announcement, with the current requests.
-    pub fn counted_of_unknown_writer(
+    pub fn note_unknown_writer(
         &mut self,
         writer: Guid,
         number: SequenceNumber,
@@ -342,7 +338,7 @@ impl Payloads {
     }
 
     /// Replaces the GUID of an unknown writer by the announced one.
-    pub fn rename(&mut self, before: Guid, guid: Guid) {
+    pub fn rename_unknown_writer(&mut self, before: Guid, guid: Guid) {
         if let Some(samples) = self.unknown_writers.remove(&before) {
             self.unknown_writers.insert(guid, samples);
         }
@@ -390,7 +386,7 @@ impl Payloads {
 
     /// Dispatches the samples of this writer that need not wait. If a bound ended the wait, returns
     /// the number below which no sample is awaited.
-    pub fn turn(
+    pub fn dispatch_ready(
         &mut self,
         writer: Guid,
         progress: &Progress,
@@ -403,31 +399,27 @@ impl Payloads {
         let room = room + interested.order.bytes();
         interested.begin(progress, now, &mut |each| queued.push(each));
         let order = &mut interested.order;
-        let forgone = order.forgone(progress, now);
+        let forgone = order.take_expired(progress, now);
         let skip = order.turn(progress, now, room, &mut |each| queued.push(each));
         self.unannounced(writer, &forgone, now);
-        queued
-            .into_iter()
-            .for_each(|queued| self.give_queued(queued));
+        queued.into_iter().for_each(|queued| self.enqueue(queued));
         skip
     }
 
     /// Dispatches all waiting samples of a writer that has ended, and reports the samples that were
     /// not retransmitted.
-    pub fn give_all(&mut self, writer: Guid, now: ModelTime) {
+    pub fn dispatch_all(&mut self, writer: Guid, now: ModelTime) {
         let nothing_awaited = Progress::default();
         let Some(interested) = self.writers.get_mut(&writer) else {
             return;
         };
-        let forgone = interested.order.forgone(&nothing_awaited, now);
+        let forgone = interested.order.take_expired(&nothing_awaited, now);
         let mut queued = Vec::new();
         interested
             .order
-            .give_all(now, &mut |each| queued.push(each));
+            .dispatch_all(now, &mut |each| queued.push(each));
         self.unannounced(writer, &forgone, now);
-        queued
-            .into_iter()
-            .for_each(|queued| self.give_queued(queued));
+        queued.into_iter().for_each(|queued| self.enqueue(queued));
     }
 
     /// Reports samples that will not arrive, at `now`.
@@ -445,7 +437,7 @@ impl Payloads {
             self.assembly.forget(writer, first);
         }
         for missed in interested.missed(writer, (first, last), (reason, now), self.payload_delay) {
-            self.give(missed, 0);
+            self.push_dispatch(missed, 0);
         }
     }
 
@@ -485,7 +477,9 @@ impl Payloads {
                     missed.samples = missed.samples.min(samples);
                 }
             }
-            missed.into_iter().for_each(|missed| self.give(missed, 0));
+            missed
+                .into_iter()
+                .for_each(|missed| self.push_dispatch(missed, 0));
         }
     }
 
@@ -500,10 +494,12 @@ impl Payloads {
             .filter_map(|run| Some((*run.first()?, *run.last()?)))
             .flat_map(|run| interested.missed(writer, run, reason, delay))
             .collect();
-        missed.into_iter().for_each(|missed| self.give(missed, 0));
+        missed
+            .into_iter()
+            .for_each(|missed| self.push_dispatch(missed, 0));
     }
 
-    fn give_queued(&mut self, queued: QueuedSample) {
+    fn enqueue(&mut self, queued: QueuedSample) {
         let bytes = queued.bytes();
         self.waiting_bytes -= queued.cost();
         if !queued.to.is_empty() {
@@ -511,16 +507,16 @@ impl Payloads {
                 to: queued.to,
                 outcome: SampleOutcome::Sample(queued.sample),
             };
-            self.give(sample, bytes);
+            self.push_dispatch(sample, bytes);
         }
         if let Some(missed) = queued.missed {
-            self.give(missed, 0);
+            self.push_dispatch(missed, 0);
         }
     }
 
     /// Queues an outcome, `bytes` of which are a payload. A sample beyond the bounds is reported as
     /// missing; the other half of the queue is for such reports.
-    fn give(&mut self, dispatches: QueuedDispatch, bytes: usize) {
+    fn push_dispatch(&mut self, dispatches: QueuedDispatch, bytes: usize) {
         let (used, limit, _) = self.size();
         let has_room = self.dispatches.len() < WaitingDispatches::CAP / 2
             && (bytes == 0 || used + bytes <= limit);
@@ -561,7 +557,7 @@ impl WantedWriter {
     ) -> Vec<QueuedDispatch> {
         let mut missed: Vec<(SequenceNumber, Vec<u64>)> = Vec::new();
         for begin in &mut self.begins {
-            let Some(from) = begin.misses_from(reason, now, payload_delay) else {
+            let Some(from) = begin.first_missed(reason, now, payload_delay) else {
                 continue;
             };
             let first = first.max(from);

@@ -47,7 +47,7 @@ const KERNEL_UPDATE_TIME: Duration = Duration::from_millis(200);
 const UNKNOWN_WRITERS_SHARE: usize = 4;
 /// Deliveries that are dropped for new ones: minimum silence, and maximum number per tick.
 const DELIVERY_TIMEOUT: Duration = Duration::from_secs(10);
-const GIVEN_UP: usize = 64;
+const MAX_DROPPED_DELIVERIES: usize = 64;
 
 /// A measured writer.
 #[derive(Debug)]
@@ -65,12 +65,12 @@ pub struct Measured {
     /// Whether an unknown writer has existed long enough to be metered.
     pub metered: bool,
     /// Cookie of the socket through which an unknown writer sends; 0 if not known.
-    pub sent_from: u64,
+    pub socket: u64,
     opened: ModelTime,
     /// Whether the wait for a gap ended without an ACKNACK.
     unacknowledged: bool,
     /// Time at which the kernel begins to capture all fragments of the writer.
-    sure_from: ModelTime,
+    complete_from: ModelTime,
 }
 
 /// All measured writers.
@@ -171,7 +171,7 @@ impl Profiler {
     }
 
     /// Stops waiting for samples of this writer below `number`.
-    pub fn skip(&mut self, guid: Guid, number: SequenceNumber) {
+    pub fn settle_below(&mut self, guid: Guid, number: SequenceNumber) {
         if let Some(measured) = self.writers.get_mut(&guid) {
             measured.unacknowledged = !measured.is_acknowledged();
             measured.writer.skip(number);
@@ -222,7 +222,7 @@ impl Profiler {
             measured.opened = now;
         }
         if measured.topic.is_none() && head.is_at_socket() && head.is_sent() {
-            measured.sent_from = head.socket;
+            measured.socket = head.socket;
         }
         if let Observation::AckNack(acknack) = observation
             && measured.writer.refuses(acknack)
@@ -240,7 +240,7 @@ impl Profiler {
             let mut context = self.shared.writer_context(writer_ref, now, journal, graph);
             let subscribers = measured
                 .subscribers
-                .get_or_insert_with(|| Box::new(Subscribers::new(measured.sure_from)));
+                .get_or_insert_with(|| Box::new(Subscribers::new(measured.complete_from)));
             novelty = subscribers.observe(observation, &mut context);
             if matches!(observation, Observation::AckNack(_))
                 && let Some(below) = subscribers.acknowledged_below()
@@ -261,7 +261,7 @@ impl Profiler {
                 .measurement_context(writer_ref, now, journal, graph.wall_clock),
         );
         if novelty == Novelty::Duplicate && head.path != Path::Wire {
-            measured.writer.came_again();
+            measured.writer.note_retransmission();
         }
         if let Some(subscribers) = &mut measured.subscribers
             && measured.writer.next() > next
@@ -272,7 +272,7 @@ impl Profiler {
     }
 
     /// Records that samples in shared memory before `now` may have been missed.
-    pub fn uncertain(&mut self, now: ModelTime) {
+    pub fn note_uncertain(&mut self, now: ModelTime) {
         for measured in self.writers.values_mut() {
             measured.writer.uncertain(now);
         }
@@ -443,7 +443,7 @@ impl Profiler {
             self.stop(*guid, now, journal, graph);
         }
         if std::mem::take(&mut self.shared.quota.wanted) {
-            self.give_up_silent(now, journal, graph);
+            self.drop_silent(now, journal, graph);
         }
         unknown_writers
     }
@@ -486,23 +486,23 @@ impl Profiler {
     }
 
     /// Drops the deliveries that have been silent longest, because a new one was refused.
-    fn give_up_silent(&mut self, now: ModelTime, journal: &mut Journal, graph: &Graph) {
+    fn drop_silent(&mut self, now: ModelTime, journal: &mut Journal, graph: &Graph) {
         let mut silent: Vec<_> = self
             .writers
             .iter()
             .filter_map(|(guid, measured)| Some((guid, measured.subscribers.as_ref()?)))
-            .flat_map(|(guid, subscribers)| subscribers.silent_since().map(|at| (at, *guid)))
+            .flat_map(|(guid, subscribers)| subscribers.last_seen_times().map(|at| (at, *guid)))
             .filter(|(at, _)| *at + DELIVERY_TIMEOUT <= now)
             .collect();
         silent.sort_unstable();
-        for (at, guid) in silent.into_iter().take(GIVEN_UP) {
+        for (at, guid) in silent.into_iter().take(MAX_DROPPED_DELIVERIES) {
             let Some(measured) = self.writers.get_mut(&guid) else {
                 continue;
             };
             let writer_ref = measured.writer_ref(guid);
             if let Some(subscribers) = &mut measured.subscribers {
                 let mut context = self.shared.writer_context(writer_ref, now, journal, graph);
-                subscribers.give_up(at, 1, &mut context);
+                subscribers.drop_oldest(at, 1, &mut context);
             }
         }
     }
@@ -581,16 +581,16 @@ impl Measured {
             first_seen: now,
             last_seen: now,
             metered: false,
-            sent_from: 0,
+            socket: 0,
             opened: ModelTime::ZERO,
             unacknowledged: false,
-            sure_from: ModelTime::ZERO,
+            complete_from: ModelTime::ZERO,
         }
     }
 
     /// Allows samples to lack fragments until the kernel knows the writer.
     fn allow_incomplete(&mut self, now: ModelTime) {
-        self.sure_from = now + KERNEL_UPDATE_TIME;
-        self.writer.allow_incomplete(self.sure_from);
+        self.complete_from = now + KERNEL_UPDATE_TIME;
+        self.writer.allow_incomplete(self.complete_from);
     }
 }

@@ -40,15 +40,16 @@ const MAX_ADDRESSES: usize = 16;
 #[derive(Debug)]
 pub struct Receivers {
     sockets: Sockets,
-    users: Bounded<Counted<UsedSockets>, HashMap<u64, SocketUsers>>,
+    socket_users: Bounded<Counted<UsedSockets>, HashMap<u64, SocketUsers>>,
     processes: Bounded<Counted<SocketProcesses>, HashMap<u32, Candidates>>,
-    /// Participants that send through a socket of this host. [`Self::tidy`] rebuilds the set.
+    /// Participants that send through a socket of this host. [`Self::remove_unknown`] rebuilds the
+    /// set.
     local: Bounded<Counted<LocalParticipants>, HashSet<GuidPrefix>>,
     /// Participants whose messages left this host through an unobserved socket or shared memory.
-    here: Bounded<Counted<ParticipantsHere>, HashSet<GuidPrefix>>,
+    local_by_departure: Bounded<Counted<ParticipantsHere>, HashSet<GuidPrefix>>,
     addresses: AnnouncedAddresses,
     closed: Bounded<ClosedSockets, HashSet<u64>>,
-    closings: Bounded<ClosedSockets, VecDeque<u64>>,
+    closed_order: Bounded<ClosedSockets, VecDeque<u64>>,
     generation: u64,
 }
 
@@ -101,16 +102,16 @@ impl Receivers {
     pub fn new(limit: usize, participants: usize) -> Self {
         Self {
             sockets: Sockets::new(limit),
-            users: Bounded::capped(limit),
+            socket_users: Bounded::capped(limit),
             processes: Bounded::capped(limit),
             local: Bounded::capped(limit * SocketOwners::CAP),
-            here: Bounded::capped(limit * SocketOwners::CAP),
+            local_by_departure: Bounded::capped(limit * SocketOwners::CAP),
             addresses: AnnouncedAddresses::new(
                 participants.saturating_mul(MAX_ADDRESSES / 2),
                 MAX_ADDRESSES,
             ),
             closed: Bounded::default(),
-            closings: Bounded::default(),
+            closed_order: Bounded::default(),
             generation: 1,
         }
     }
@@ -137,7 +138,7 @@ impl Receivers {
     #[must_use]
     pub fn holders(&self) -> HashMap<GuidPrefix, &SocketFacts> {
         let mut holders: HashMap<GuidPrefix, &SocketFacts> = HashMap::new();
-        for (cookie, users) in &self.users {
+        for (cookie, users) in &self.socket_users {
             let Some(facts) = self.sockets.get(*cookie) else {
                 continue;
             };
@@ -174,7 +175,7 @@ impl Receivers {
         if !is_new || process == before {
             return;
         }
-        if let (Some(process), Some(users)) = (process, self.users.get(&cookie))
+        if let (Some(process), Some(users)) = (process, self.socket_users.get(&cookie))
             && let Some(known) = self
                 .processes
                 .get_or_insert_with(process, Candidates::default)
@@ -194,8 +195,8 @@ impl Receivers {
     /// Records that this socket was closed.
     pub fn socket_closed(&mut self, cookie: u64) {
         self.sockets.remove(cookie);
-        self.users.remove(&cookie);
-        if let Some(oldest) = self.closings.push_back(cookie) {
+        self.socket_users.remove(&cookie);
+        if let Some(oldest) = self.closed_order.push_back(cookie) {
             self.closed.remove(&oldest);
         }
         self.closed.insert(cookie);
@@ -216,13 +217,13 @@ impl Receivers {
     /// Returns whether this participant sends from this host.
     #[must_use]
     pub fn is_local(&self, prefix: &GuidPrefix) -> bool {
-        self.local.contains(prefix) || self.here.contains(prefix)
+        self.local.contains(prefix) || self.local_by_departure.contains(prefix)
     }
 
     /// Records that a message of this participant left this host through an unobserved socket or
     /// shared memory. Returns false if the table is full.
-    pub fn found_here(&mut self, prefix: GuidPrefix) -> bool {
-        self.here.insert(prefix) || self.here.contains(&prefix)
+    pub fn note_local(&mut self, prefix: GuidPrefix) -> bool {
+        self.local_by_departure.insert(prefix) || self.local_by_departure.contains(&prefix)
     }
 
     /// Learns the owner of a socket from an observation. Returns whether a socket of this host sent
@@ -247,7 +248,7 @@ impl Receivers {
             return false;
         }
         let owner = if is_sent { sender } else { directed };
-        let known = self.users.get(&socket);
+        let known = self.socket_users.get(&socket);
         let list = known.map(|known| {
             if is_sent {
                 &known.senders
@@ -258,7 +259,10 @@ impl Receivers {
         if list.is_some_and(|list| list.0.contains(&owner)) {
             return is_sent && known.is_some_and(|known| !known.is_crowded);
         }
-        let Some(known) = self.users.get_or_insert_with(socket, SocketUsers::default) else {
+        let Some(known) = self
+            .socket_users
+            .get_or_insert_with(socket, SocketUsers::default)
+        else {
             return false;
         };
         let mut is_local = false;
@@ -285,8 +289,11 @@ impl Receivers {
     }
 
     /// Records that this participant owns a socket of this host.
-    pub fn sends(&mut self, socket: u64, owner: GuidPrefix) {
-        let Some(known) = self.users.get_or_insert_with(socket, SocketUsers::default) else {
+    pub fn add_owner(&mut self, socket: u64, owner: GuidPrefix) {
+        let Some(known) = self
+            .socket_users
+            .get_or_insert_with(socket, SocketUsers::default)
+        else {
             return;
         };
         known.senders = Candidates::default();
@@ -303,9 +310,12 @@ impl Receivers {
         self.generation += 1;
     }
 
-    /// Withdraws a claim of [`Self::sends`]: the participant may not own the socket.
-    pub fn sends_no_longer(&mut self, socket: u64, owner: GuidPrefix) {
-        let users = self.users.get_mut(&socket).map(|users| &mut users.senders);
+    /// Withdraws a claim of [`Self::add_owner`]: the participant may not own the socket.
+    pub fn remove_owner(&mut self, socket: u64, owner: GuidPrefix) {
+        let users = self
+            .socket_users
+            .get_mut(&socket)
+            .map(|users| &mut users.senders);
         let process = self.sockets.get(socket).and_then(|facts| facts.process_id);
         let process = process.and_then(|process| self.processes.get_mut(&process));
         for candidates in users.into_iter().chain(process) {
@@ -329,22 +339,22 @@ impl Receivers {
 
     /// Removes the evidence of participants that neither exist nor wait for a free entry in
     /// discovery.
-    pub fn tidy(&mut self, discovery: &Discovery) {
+    pub fn remove_unknown(&mut self, discovery: &Discovery) {
         let is_there = |prefix: &GuidPrefix| discovery.knows(*prefix);
         self.addresses.retain(is_there);
-        self.here.retain(is_there);
-        for users in self.users.values_mut() {
+        self.local_by_departure.retain(is_there);
+        for users in self.socket_users.values_mut() {
             users.senders.0.retain(is_there);
             users.addressed.0.retain(is_there);
         }
-        self.users
+        self.socket_users
             .retain(|_, users| !users.senders.0.is_empty() || !users.addressed.0.is_empty());
         for candidates in self.processes.values_mut() {
             candidates.0.retain(is_there);
         }
         self.processes
             .retain(|_, candidates| !candidates.0.is_empty());
-        let sockets = self.users.values().filter(|users| !users.is_crowded);
+        let sockets = self.socket_users.values().filter(|users| !users.is_crowded);
         self.local.clear();
         for owner in sockets.flat_map(|users| users.senders.0.iter()) {
             self.local.insert(*owner);
@@ -370,7 +380,7 @@ impl Receivers {
         domain_id: Option<DomainId>,
     ) -> Vec<GuidPrefix> {
         if route.socket != 0 {
-            let users = self.users.get(&route.socket);
+            let users = self.socket_users.get(&route.socket);
             let facts = self.sockets.get(route.socket);
             let process = facts.and_then(|facts| facts.process_id);
             let lists = [
@@ -403,7 +413,9 @@ impl Receivers {
                 return open;
             }
             let announced = facts.and_then(|facts| facts.own_process_id);
-            if let Some(owner) = announced.and_then(|process| announced_in(process, discovery)) {
+            if let Some(owner) =
+                announced.and_then(|process| participant_of_process(process, discovery))
+            {
                 return vec![owner];
             }
         }
@@ -416,7 +428,7 @@ impl Receivers {
 
 /// Returns the only participant that announces this process id, or `None`. Fast DDS announces only
 /// the low 16 bits.
-fn announced_in(process: u32, discovery: &Discovery) -> Option<GuidPrefix> {
+fn participant_of_process(process: u32, discovery: &Discovery) -> Option<GuidPrefix> {
     let mut announced = discovery.participants().iter().filter(|(_, participant)| {
         participant
             .proxy

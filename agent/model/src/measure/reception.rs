@@ -11,13 +11,15 @@ use ros2probe_wire::{RtpsTime, SequenceNumber};
 use crate::facts::model_time::ModelTime;
 use crate::facts::observation::{Content, DataFrag, Gap, Heartbeat, Sample};
 use crate::measure::samples::{Budget, Facts, Progress, Samples};
-use crate::measure::sequence::{Arrival, REACH, RepairMode, RunMembership, Sequence, Settled};
+use crate::measure::sequence::{
+    Arrival, MAX_TRUSTED_JUMP, RepairMode, RunMembership, Sequence, Settled,
+};
 
 /// Minimum nanoseconds from the last fragment number to the completing fragment that indicate a
 /// retransmission.
-const REPAIR: i64 = 5_000_000;
+const MIN_REPAIR_DELAY: i64 = 5_000_000;
 /// Number of samples before the newest one for whose fragments a sampled view still waits.
-const UNDER_WAY: u64 = 8;
+const PENDING_SAMPLES: u64 = 8;
 
 /// State of one writer's samples at one point.
 #[derive(Debug, Default)]
@@ -107,7 +109,7 @@ impl Reception {
         budget: &mut Budget,
     ) -> bool {
         if !unconfirmed {
-            let oldest = sample.sequence_number.saturating_sub(UNDER_WAY);
+            let oldest = sample.sequence_number.saturating_sub(PENDING_SAMPLES);
             self.samples.forget_below(oldest, budget);
         }
         let progress = self.samples.fragment(sample, fragments, budget);
@@ -159,7 +161,7 @@ impl Reception {
         let (number, now) = (sample.sequence_number, sample.head.at);
         let source = sample.source_timestamp.timestamp();
         let Self { sequence, samples } = self;
-        match sequence.recognise(number, source, REACH, now) {
+        match sequence.recognise(number, source, MAX_TRUSTED_JUMP, now) {
             RunMembership::Live => true,
             RunMembership::Unconfirmed { .. } => false,
             RunMembership::Confirmed(run) => {
@@ -241,7 +243,7 @@ impl Reception {
         self.samples.clear(budget);
     }
 
-    /// Excuses all samples after the last one that arrived, because the receiver is gone.
+    /// Marks all samples after the last one that arrived irrelevant, because the receiver is gone.
     pub fn close(&mut self, budget: &mut Budget) {
         let sequence = &mut self.sequence;
         for number in sequence.settled().until(sequence.next()).rev() {
@@ -249,7 +251,7 @@ impl Reception {
                 return;
             }
             self.samples.forget(number, budget);
-            sequence.excuse(number, number.next());
+            sequence.mark_irrelevant(number, number.next());
         }
     }
 
@@ -263,7 +265,7 @@ impl Reception {
         decide: &mut impl FnMut(Decision),
     ) {
         let Self { sequence, samples } = self;
-        let hold = samples.growing(now, window, sequence.settled());
+        let hold = samples.lowest_growing(now, window, sequence.settled());
         sequence.advance(now, (window, grace), hold, &mut |settled| {
             decide(decision(settled, samples, budget));
         });
@@ -349,7 +351,7 @@ impl Reception {
             Progress::TooMany => {
                 self.sequence.begin(number);
                 self.exists(number, now, budget, decide);
-                self.sequence.excuse(number, number.next());
+                self.sequence.mark_irrelevant(number, number.next());
                 return Outcome::Open;
             }
             Progress::Partial | Progress::Complete(_) => {}
@@ -374,7 +376,7 @@ impl Reception {
         let Arrival::New { recovered, .. } = arrival else {
             return Outcome::Open;
         };
-        let repaired = reliable && facts.repaired_after >= REPAIR;
+        let repaired = reliable && facts.repaired_after >= MIN_REPAIR_DELAY;
         Outcome::Complete(CompleteSample {
             recovered: recovered || repaired,
             ..whole_fragments(sample, &facts)
@@ -416,7 +418,7 @@ fn decision(settled: Settled, samples: &mut Samples, budget: &mut Budget) -> Dec
         }
         Settled::Lost(number) => (number, number),
         Settled::LostRun(start, end) => (start, end.previous()),
-        // A sample with fragments was sent, so no excuse applies.
+        // A sample with fragments was sent, so it is not irrelevant.
         Settled::Irrelevant(number) if samples.is_partial(number) => (number, number),
         Settled::Irrelevant(number) => return Decision::Irrelevant(number),
     };

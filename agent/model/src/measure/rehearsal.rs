@@ -1,5 +1,5 @@
-//! Evaluates expectations on seconds that were counted earlier, as [`Judgement`] evaluates them
-//! live. Thresholds that were learnt from a robot are checked on the counts of the same robot.
+//! Evaluates expectations on seconds that were counted earlier, as [`TopicEvaluation`] evaluates
+//! them live. Thresholds that were learnt from a robot are checked on the counts of the same robot.
 
 use std::time::Duration;
 
@@ -10,13 +10,13 @@ use crate::facts::model_time::ModelTime;
 use crate::facts::rate::Slot;
 use crate::facts::watch::Expectations;
 use crate::facts::watch::WatchState;
-use crate::measure::expectation::{Evidence, Judgement};
+use crate::measure::expectation::{Evidence, TopicEvaluation};
 
 pub use crate::facts::rate::SECONDS;
-pub use crate::measure::expectation::{GRACE, window};
+pub use crate::measure::expectation::{STARTUP_GRACE_SECONDS, window};
 
 /// Model time at which a rehearsal begins, in seconds: late enough for a silence before it.
-const BEGIN: u64 = 1_000_000;
+const START_SECOND: u64 = 1_000_000;
 
 /// Counts of one second of a topic. The type is small, because a client keeps hours of many topics.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -44,7 +44,7 @@ pub struct Second {
 /// second without a publisher violates nothing.
 #[must_use]
 pub fn violations(expectations: &Expectations, seconds: &[Second]) -> Vec<&'static str> {
-    let mut judgement = Judgement::default();
+    let mut judgement = TopicEvaluation::default();
     let mut violated = Vec::new();
     let first = seconds.iter().position(|second| second.messages > 0);
     let (mut since, mut observed) = (0, 0);
@@ -68,7 +68,7 @@ pub fn violations(expectations: &Expectations, seconds: &[Second]) -> Vec<&'stat
                 publishers: second.publishers.into(),
                 subscriptions: second.subscriptions.into(),
                 last_message: second.silence.map(|silence| now - duration(silence)),
-                seeming_silence: &|_| Duration::ZERO,
+                max_unseen_time: &|_| Duration::ZERO,
                 since: instant(since),
                 observed: instant(observed),
                 recent: &recent,
@@ -119,11 +119,11 @@ fn loss(seconds: &[Second], end: usize) -> LossShare {
 }
 
 fn instant(place: usize) -> ModelTime {
-    ModelTime::from_nanoseconds((BEGIN + place as u64) * SECOND)
+    ModelTime::from_nanoseconds((START_SECOND + place as u64) * SECOND)
 }
 
 fn duration(seconds: f32) -> Duration {
-    // The maximum is shorter than the time before `BEGIN`.
+    // The maximum is shorter than the time before `START_SECOND`.
     Duration::try_from_secs_f32(seconds.clamp(0.0, 900_000.0)).unwrap_or_default()
 }
 
@@ -131,7 +131,7 @@ fn duration(seconds: f32) -> Duration {
 mod tests {
     use super::*;
 
-    fn steady(messages: u32) -> Second {
+    fn steady_seconds(messages: u32) -> Second {
         Second {
             messages,
             silence: Some(0.1),
@@ -152,8 +152,8 @@ mod tests {
     }
 
     #[test]
-    fn one_slow_second_violates_nothing_and_two_in_a_row_violate_the_rate() {
-        let mut seconds = vec![steady(10); 60];
+    fn two_consecutive_slow_seconds_violate_the_rate_and_one_does_not() {
+        let mut seconds = vec![steady_seconds(10); 60];
         seconds[0].messages = 1;
         seconds[30].messages = 3;
         assert!(violations(&expecting(), &seconds).is_empty());
@@ -166,7 +166,10 @@ mod tests {
         // 40 Hz on a busy robot, in pairs of slow seconds.
         let busy = |part: u32| -> Vec<Second> {
             let counts = [24, 26, 46, 44, 46, 46, 40, 48].into_iter().cycle();
-            counts.take(80).map(|count| steady(count / part)).collect()
+            counts
+                .take(80)
+                .map(|count| steady_seconds(count / part))
+                .collect()
         };
         let expecting = |window_s| Expectations {
             min_rate_hz: Some(30.0),
@@ -180,7 +183,7 @@ mod tests {
 
     #[test]
     fn silence_and_a_missing_subscriber_are_reported_by_their_keys() {
-        let mut silent = vec![steady(10); 60];
+        let mut silent = vec![steady_seconds(10); 60];
         for (place, second) in silent.iter_mut().enumerate().skip(40) {
             second.messages = 0;
             second.silence = Some((place - 39) as f32);

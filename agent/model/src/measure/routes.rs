@@ -48,7 +48,7 @@ pub struct KnownRoute {
     /// Time of the last observation.
     pub last_seen: ModelTime,
     /// Number of new samples that arrived on it.
-    pub brought: u64,
+    pub new_samples: u64,
     /// Whether it is observed at a socket rather than on a wire.
     pub at_socket: bool,
     /// Whether samples, rather than only control messages, have used it.
@@ -128,7 +128,7 @@ impl Routes {
             is_shared: false,
             delivery: None,
             last_seen: now,
-            brought: 0,
+            new_samples: 0,
             at_socket: false,
             has_data: false,
             left: Bounded::default(),
@@ -170,7 +170,7 @@ impl Routes {
 
     /// Returns the outgoing route to this destination.
     #[must_use]
-    pub fn leaving(&self, destination: Destination) -> Option<&KnownRoute> {
+    pub fn outgoing(&self, destination: Destination) -> Option<&KnownRoute> {
         self.find(&Route {
             direction: Direction::Sent,
             socket: 0,
@@ -218,7 +218,7 @@ impl KnownRoute {
     }
 
     /// Records that all samples up to this number have left by `now`.
-    pub fn mark(&mut self, number: SequenceNumber, now: ModelTime) {
+    pub fn note_departure(&mut self, number: SequenceNumber, now: ModelTime) {
         let is_due = self
             .left
             .back()
@@ -230,7 +230,7 @@ impl KnownRoute {
 
     /// Returns the highest number that had left by this time.
     #[must_use]
-    pub fn left_by(&self, at: ModelTime) -> Option<SequenceNumber> {
+    pub fn departed_by(&self, at: ModelTime) -> Option<SequenceNumber> {
         let mut left = self.left.iter().rev();
         left.find(|(moment, _)| *moment <= at)
             .map(|(_, number)| *number)
@@ -257,16 +257,16 @@ mod tests {
             is_shared: false,
             delivery: None,
             last_seen: ModelTime::ZERO,
-            brought: 0,
+            new_samples: 0,
             at_socket: true,
             has_data: true,
             left: Bounded::default(),
         };
         let at = |tenths: u64| ModelTime::from_nanoseconds((1000 + tenths) * SECOND / 10);
-        (0..1000).for_each(|tenths| known.mark(SequenceNumber(tenths * 3), at(tenths)));
-        assert_eq!(known.left_by(at(500)), None);
-        assert_eq!(known.left_by(at(905)), Some(SequenceNumber(2700)));
-        assert_eq!(known.left_by(at(2000)), Some(SequenceNumber(2970)));
+        (0..1000).for_each(|tenths| known.note_departure(SequenceNumber(tenths * 3), at(tenths)));
+        assert_eq!(known.departed_by(at(500)), None);
+        assert_eq!(known.departed_by(at(905)), Some(SequenceNumber(2700)));
+        assert_eq!(known.departed_by(at(2000)), Some(SequenceNumber(2970)));
         assert!(known.left.len() <= DepartureTimes::CAP);
     }
 }

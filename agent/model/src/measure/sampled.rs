@@ -19,21 +19,21 @@ const SAMPLED_TIMEOUT: Duration = Duration::from_secs(10);
 /// Time that an unseen sample may take to arrive by another transport before it is skipped.
 const ARRIVAL_TIMEOUT: Duration = Duration::from_millis(200);
 /// Accepted probability that a silence is claimed while messages are sent.
-const FALSE_SILENCE: f64 = 1e-6;
+const FALSE_SILENCE_PROBABILITY: f64 = 1e-6;
 /// Number of messages presumed before the first one is seen, and the share of them that polling
 /// missed. On a busy machine, polling misses nine of ten large messages. The same is presumed after
 /// a missed message: its cause, such as a large message sent with it, also hides the next ones.
-const PRESUMED: f64 = 2.0;
-const PRESUMED_MISSED: f64 = 0.9;
+const PRESUMED_MESSAGES: f64 = 2.0;
+const PRESUMED_MISSED_SHARE: f64 = 0.9;
 /// Maximum time in which polling sees no message of a topic on a busy machine. Measured with Fast
 /// DDS: 0.4 s on an idle machine, more than 2 s for point clouds at a load of 10.
-const POLLING_HOLE: Duration = Duration::from_secs(10);
+const MAX_POLLING_GAP: Duration = Duration::from_secs(10);
 /// Factor by which a row of missed messages may exceed the longest one so far.
-const LONGER: f64 = 3.0;
+const MISSED_RUN_FACTOR: f64 = 3.0;
 /// Weight of the newest interval in the moving average.
-const NEWEST: f64 = 0.125;
+const NEWEST_WEIGHT: f64 = 0.125;
 /// Number of sequence numbers below the next one that are tracked individually.
-const WINDOW: u64 = u128::BITS as u64;
+const WINDOW_LEN: u64 = u128::BITS as u64;
 
 /// State of one writer's sampled view.
 #[derive(Debug)]
@@ -46,18 +46,18 @@ pub struct Sampled {
     seen: u64,
     uncertain: u64,
     /// Number of times that one or more unseen messages preceded a seen one.
-    holes: u64,
+    unseen_runs: u64,
     /// Maximum number of unseen messages in a row so far.
-    longest_hole: u64,
+    longest_unseen_run: u64,
     /// Moving average of the time between messages, in seconds.
     interval: Option<f64>,
     /// Messages known from HEARTBEATs and ACKNACKs whose size is not known yet.
     unmeasured: u64,
     /// Bit `i`: the number `i + 1` below `next` was seen or is not awaited.
-    sighted: u128,
+    seen_bits: u128,
     /// Bit `i`: that sample was seen completely, or its last fragment was seen without some others.
     finished: u128,
-    /// The number to which the bits of `sighted` and `finished` are relative.
+    /// The number to which the bits of `seen_bits` and `finished` are relative.
     next: SequenceNumber,
     /// No sample below this number is awaited.
     settled: SequenceNumber,
@@ -112,11 +112,11 @@ impl Sampled {
             span: 0,
             seen: 0,
             uncertain: 0,
-            holes: 0,
-            longest_hole: 0,
+            unseen_runs: 0,
+            longest_unseen_run: 0,
             interval: None,
             unmeasured: 0,
-            sighted: u128::MAX,
+            seen_bits: u128::MAX,
             finished: u128::MAX,
             next: SequenceNumber::ZERO,
             settled: SequenceNumber::ZERO,
@@ -162,16 +162,21 @@ impl Sampled {
     }
 
     /// Processes a sample that [`Self::awaits`] accepts, or a fragment of one, after [`Self::end`].
-    pub fn catch_up(&mut self, number: SequenceNumber, seen: Completeness) -> SampledUpdate {
+    pub fn add_late(&mut self, number: SequenceNumber, seen: Completeness) -> SampledUpdate {
         SampledUpdate {
-            finished: self.sight(number, seen),
+            finished: self.mark_seen(number, seen),
             ..SampledUpdate::default()
         }
     }
 
     /// Takes over counted samples that another view saw in part. `next` is the number after the
     /// newest.
-    pub fn take_over(&mut self, partial: &[SequenceNumber], next: SequenceNumber, now: ModelTime) {
+    pub fn add_partial(
+        &mut self,
+        partial: &[SequenceNumber],
+        next: SequenceNumber,
+        now: ModelTime,
+    ) {
         self.follow(next, now);
         for &number in partial {
             match self.bit(number, next) {
@@ -235,11 +240,11 @@ impl Sampled {
         clippy::cast_precision_loss,
         reason = "counts of samples are far below 2^52"
     )]
-    pub fn pace(&mut self, samples: u64, since: ModelTime, now: ModelTime) {
+    pub fn note_interval(&mut self, samples: u64, since: ModelTime, now: ModelTime) {
         if samples > 0 && since != ModelTime::ZERO {
             let newest = (now - since).as_secs_f64() / samples as f64;
             let mean = self.interval.unwrap_or(newest);
-            self.interval = Some(mean + NEWEST * (newest - mean));
+            self.interval = Some(mean + NEWEST_WEIGHT * (newest - mean));
         }
     }
 
@@ -251,27 +256,28 @@ impl Sampled {
         clippy::cast_precision_loss,
         reason = "counts of samples are far below 2^52"
     )]
-    pub fn seeming_silence(&self, slowest: Duration) -> Duration {
+    pub fn max_unseen_time(&self, slowest: Duration) -> Duration {
         if self.last == ModelTime::ZERO {
             return Duration::ZERO;
         }
         let interval = self.interval.unwrap_or(slowest.as_secs_f64());
         let unseen = self.span.saturating_sub(self.seen);
         let share = |missed: u64, of: u64| {
-            (missed as f64 + PRESUMED * PRESUMED_MISSED) / (of as f64 + PRESUMED)
+            (missed as f64 + PRESUMED_MESSAGES * PRESUMED_MISSED_SHARE)
+                / (of as f64 + PRESUMED_MESSAGES)
         };
         let missed = share(unseen, self.span);
-        let missed_again = share(unseen.saturating_sub(self.holes), unseen);
-        let messages = 1.0 + (FALSE_SILENCE.ln() - missed.ln()) / missed_again.ln();
-        let messages = messages.max(LONGER * self.longest_hole as f64);
+        let missed_again = share(unseen.saturating_sub(self.unseen_runs), unseen);
+        let messages = 1.0 + (FALSE_SILENCE_PROBABILITY.ln() - missed.ln()) / missed_again.ln();
+        let messages = messages.max(MISSED_RUN_FACTOR * self.longest_unseen_run as f64);
         let silence = Duration::try_from_secs_f64(messages * interval).unwrap_or(Duration::MAX);
-        silence.max(POLLING_HOLE)
+        silence.max(MAX_POLLING_GAP)
     }
 
-    /// As [`Self::seeming_silence`], for a writer that polling has not seen yet.
+    /// As [`Self::max_unseen_time`], for a writer that polling has not seen yet.
     #[must_use]
-    pub fn seeming_silence_of_unseen(slowest: Duration) -> Duration {
-        Self::new(ModelTime::from_nanoseconds(1)).seeming_silence(slowest)
+    pub fn max_unseen_time_of_new_writer(slowest: Duration) -> Duration {
+        Self::new(ModelTime::from_nanoseconds(1)).max_unseen_time(slowest)
     }
 
     /// Returns the counts so far.
@@ -308,12 +314,12 @@ impl Sampled {
         }
         let before = sequence.next();
         self.follow(before, now);
-        let is_told_only = self
+        let is_unseen = self
             .bit(number, before)
-            .is_some_and(|bit| self.sighted & bit == 0);
+            .is_some_and(|bit| self.seen_bits & bit == 0);
         let belief = match source {
             // The sample is late, and its writer has not restarted.
-            Some(source) if is_told_only => {
+            Some(source) if is_unseen => {
                 sequence.sourced(number, source);
                 RunMembership::Live
             }
@@ -339,10 +345,10 @@ impl Sampled {
         let samples = self.confirm(&run, samples);
         self.span += samples;
         let hole = samples.saturating_add(self.unmeasured).saturating_sub(1);
-        self.holes += u64::from(hole > 0);
-        self.longest_hole = self.longest_hole.max(hole);
+        self.unseen_runs += u64::from(hole > 0);
+        self.longest_unseen_run = self.longest_unseen_run.max(hole);
         let below = sequence.next().steps_since(number.next());
-        let finished = self.sight(number, seen);
+        let finished = self.mark_seen(number, seen);
         let mut update = SampledUpdate {
             samples,
             alike: samples.saturating_add(std::mem::take(&mut self.unmeasured)),
@@ -363,7 +369,7 @@ impl Sampled {
 
     /// Records that samples up to `last` exist, from a HEARTBEAT or ACKNACK. Returns how many of
     /// them are new.
-    pub fn exist(
+    pub fn note_existing(
         &mut self,
         last: SequenceNumber,
         reach: u64,
@@ -404,13 +410,13 @@ impl Sampled {
         if start == SequenceNumber::ZERO {
             return 0;
         }
-        let samples = self.exist(start.previous(), reach, now, sequence);
+        let samples = self.note_existing(start.previous(), reach, now, sequence);
         let ahead = end.steps_since(sequence.next());
         if sequence.started() && start <= sequence.next() && ahead <= reach {
             let skipped = self.advance(end, false, now, sequence);
             let bits = u32::try_from(skipped).unwrap_or(u32::MAX);
             let skipped = 1_u128.checked_shl(bits).map_or(u128::MAX, |bit| bit - 1);
-            self.sighted |= skipped;
+            self.seen_bits |= skipped;
             self.finished |= skipped;
         }
         samples
@@ -455,7 +461,7 @@ impl Sampled {
     fn confirm(&mut self, run: &Run, samples: u64) -> u64 {
         for &(number, is_whole) in &run.numbers {
             let bit = self.bit(number, self.next).unwrap_or(0);
-            self.sighted |= bit;
+            self.seen_bits |= bit;
             if is_whole {
                 self.finished |= bit;
             }
@@ -464,10 +470,10 @@ impl Sampled {
     }
 
     /// Marks a sample as seen. Returns whether this ends the wait for the sample.
-    fn sight(&mut self, number: SequenceNumber, seen: Completeness) -> bool {
+    fn mark_seen(&mut self, number: SequenceNumber, seen: Completeness) -> bool {
         let bit = self.bit(number, self.next).unwrap_or(0);
-        if self.sighted & bit != bit {
-            self.sighted |= bit;
+        if self.seen_bits & bit != bit {
+            self.seen_bits |= bit;
             self.seen += 1;
         }
         let finished = seen != Completeness::Partial && self.awaits(number);
@@ -496,7 +502,7 @@ impl Sampled {
         if end <= next {
             return 0;
         }
-        let oldest = end.saturating_sub(WINDOW);
+        let oldest = end.saturating_sub(WINDOW_LEN);
         self.settle(oldest.min(next));
         if oldest > next {
             if sent {
@@ -510,7 +516,7 @@ impl Sampled {
         }
         let samples = end - next;
         let bits = u32::try_from(samples).unwrap_or(u32::MAX);
-        self.sighted = self.sighted.checked_shl(bits).unwrap_or(0);
+        self.seen_bits = self.seen_bits.checked_shl(bits).unwrap_or(0);
         self.finished = self.finished.checked_shl(bits).unwrap_or(0);
         self.next = end;
         samples
@@ -526,14 +532,14 @@ impl Sampled {
 
     /// Marks all numbers below `next` as seen or not awaited.
     const fn begin(&mut self, next: SequenceNumber, now: ModelTime) {
-        (self.sighted, self.finished) = (u128::MAX, u128::MAX);
+        (self.seen_bits, self.finished) = (u128::MAX, u128::MAX);
         (self.next, self.settled, self.last_settled) = (next, next, (now, next));
         self.settled_before = now;
     }
 
     /// Stops waiting for numbers below `end`; unseen ones are skipped.
     fn settle(&mut self, end: SequenceNumber) {
-        let known = self.next.saturating_sub(WINDOW).max(self.settled);
+        let known = self.next.saturating_sub(WINDOW_LEN).max(self.settled);
         for number in known.until(end.min(self.next)) {
             let bit = self.bit(number, self.next);
             if bit.is_some_and(|bit| self.finished & bit == 0) {

@@ -51,8 +51,9 @@ impl Budget {
 pub struct Samples {
     partial: Bounded<PartialSamples, Vec<Partial>>,
     /// Samples that began before this time may lack fragments that were not captured.
-    sure_from: ModelTime,
-    /// Whether bytes were missed since the last sample began, perhaps its next one's first fragments.
+    complete_from: ModelTime,
+    /// Whether bytes were missed since the last sample began, perhaps its next one's first
+    /// fragments.
     interrupted: bool,
 }
 
@@ -172,7 +173,7 @@ impl Samples {
 
     /// Allows samples that begin before `until` to lack fragments that the kernel did not capture.
     pub const fn allow_incomplete(&mut self, until: ModelTime) {
-        self.sure_from = until;
+        self.complete_from = until;
     }
 
     /// Allows the unfinished samples, and a next one without its first fragment, to be incomplete:
@@ -194,7 +195,7 @@ impl Samples {
     /// Returns the lowest number, not below `first`, of a sample that still receives fragments.
     /// That sample and later ones are not decided yet.
     #[must_use]
-    pub fn growing(
+    pub fn lowest_growing(
         &self,
         now: ModelTime,
         window: Duration,
@@ -271,7 +272,7 @@ impl Samples {
             size: fragments.sample_size,
             fragment_size: fragments.fragment_size,
             seen: 0,
-            uncertain: began < self.sure_from || was_interrupted && fragments.starting > 1,
+            uncertain: began < self.complete_from || was_interrupted && fragments.starting > 1,
             bitmap: Vec::new(),
             tail: None,
             latest: sample.head.at,
@@ -482,7 +483,7 @@ mod tests {
         let (mut samples, mut budget) = (Samples::default(), budget());
         put(&mut samples, &fragment(4, 1, 1, 9000), 100, &mut budget);
         assert_eq!(
-            samples.growing(
+            samples.lowest_growing(
                 ModelTime::from_nanoseconds(150),
                 Duration::from_nanos(100),
                 SequenceNumber(0)
@@ -490,7 +491,7 @@ mod tests {
             Some(SequenceNumber(4))
         );
         assert_eq!(
-            samples.growing(
+            samples.lowest_growing(
                 ModelTime::from_nanoseconds(250),
                 Duration::from_nanos(100),
                 SequenceNumber(0)

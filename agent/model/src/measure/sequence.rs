@@ -1,11 +1,11 @@
 //! Sequence numbers of one writer: which samples arrived, and which never will.
 //!
 //! A gap does not count as a loss immediately: it stays open for the settle window, so that
-//! reordered or retransmitted samples can fill it. Numbers excused by a GAP, an ACKNACK or the
-//! start of observation are never lost. The firstSN of a HEARTBEAT excuses nothing: a missing
-//! sample that the writer no longer has is lost (RTPS 2.5, 8.4.10.4, `lost_changes_update`). Memory
-//! is two or three bitmaps that grow with the undecided numbers, up to [`MAX_WINDOW`]. The module
-//! reads neither payloads nor a clock; callers pass the times in.
+//! reordered or retransmitted samples can fill it. Numbers made irrelevant by a GAP, an ACKNACK or
+//! the start of observation are never lost. The firstSN of a HEARTBEAT makes no number irrelevant:
+//! a missing sample that the writer no longer has is lost (RTPS 2.5, 8.4.10.4,
+//! `lost_changes_update`). Memory is two or three bitmaps that grow with the undecided numbers, up
+//! to [`MAX_WINDOW`]. The module reads neither payloads nor a clock; callers pass the times in.
 
 mod bitmap;
 mod runs;
@@ -22,7 +22,7 @@ use crate::facts::model_time::ModelTime;
 use crate::facts::tables::{Checkpoints, SequenceGaps};
 use bitmap::Bitmap;
 pub use unconfirmed::Run;
-use unconfirmed::{CONFIRMATIONS, UnconfirmedRun};
+use unconfirmed::{REQUIRED_CONFIRMATIONS, UnconfirmedRun};
 
 /// Initial size of the window: the undecided and recently decided numbers that are remembered.
 const MIN_WINDOW: u64 = 512;
@@ -33,20 +33,20 @@ pub const MAX_WINDOW: u64 = 32_768;
 /// losses.
 const MAX_JUMP: u64 = 1 << 20;
 /// Maximum distance by which a HEARTBEAT or GAP may exceed the received numbers, even if two agree.
-pub const FAR: u64 = 4096;
+pub const MAX_ANNOUNCED_JUMP: u64 = 4096;
 /// A number further ahead than this is unconfirmed, as is a single HEARTBEAT or GAP that claims it.
-pub const REACH: u64 = 64;
+pub const MAX_TRUSTED_JUMP: u64 = 64;
 /// A gap that fills within this time without a request is attributed to reordering. Retransmissions
 /// take longer even if their ACKNACK was not seen: readers wait 5 ms (Fast DDS) to 100 ms (Cyclone
 /// DDS) before they answer a HEARTBEAT.
-const REORDERING: Duration = Duration::from_millis(5);
+const MAX_REORDERING: Duration = Duration::from_millis(5);
 /// A lower number with a source time later by this much begins a new incarnation of the writer.
-const INCARNATION: Duration = Duration::from_millis(100);
+const MIN_INCARNATION_GAP: Duration = Duration::from_millis(100);
 /// This many consecutive samples below the window also begin a new incarnation, whatever their
 /// source times.
-const STALE: u32 = 1024;
+const MAX_STALE: u32 = 1024;
 /// Number of steps per window in which settling advances.
-const STEPS: u32 = 16;
+const SETTLING_STEPS: u32 = 16;
 
 /// State of one writer's sequence numbers.
 #[derive(Debug, Default)]
@@ -69,7 +69,7 @@ pub struct Sequence {
     /// Number of restarts.
     incarnation: u32,
     received: Bitmap,
-    excused: Bitmap,
+    irrelevant: Bitmap,
     /// The numbers in `received` that only arrived by another route, if any did.
     elsewhere: Option<Box<Bitmap>>,
     /// Earlier values of `next` with their times, oldest first.
@@ -143,7 +143,7 @@ pub enum RepairMode {
 pub enum Settled {
     /// The number never arrived.
     Lost(SequenceNumber),
-    /// The writer excused the number.
+    /// The number is irrelevant.
     Irrelevant(SequenceNumber),
     /// Lost numbers from the first up to, but not including, the second: the window is too small
     /// for them.
@@ -228,7 +228,7 @@ impl Sequence {
         self.older += 1;
         // After many older source times, the newest one was forged or the writer's clock was set
         // back.
-        if source >= self.newest_source || self.older >= CONFIRMATIONS {
+        if source >= self.newest_source || self.older >= REQUIRED_CONFIRMATIONS {
             (self.newest_source, self.newest, self.older) = (source, number, 0);
         }
     }
@@ -268,7 +268,7 @@ impl Sequence {
             let first = number.0 % 64;
             let bits = (self.next - number).min(64 - first);
             let mask = (u64::MAX >> (64 - bits)) << first;
-            let decided = self.received.word(number) | self.excused.word(number);
+            let decided = self.received.word(number) | self.irrelevant.word(number);
             undecided += u64::from((!decided & mask).count_ones());
             number += bits;
         }
@@ -301,7 +301,7 @@ impl Sequence {
 
     /// Returns how many remembered numbers arrived both here and at `other`.
     #[must_use]
-    pub fn common_with(&self, other: &Self) -> u64 {
+    pub fn count_common(&self, other: &Self) -> u64 {
         if !self.started() || !other.started() {
             return 0;
         }
@@ -317,7 +317,7 @@ impl Sequence {
         if !self.started() || !other.started() {
             return;
         }
-        if other.next > self.next && other.next - self.next <= FAR {
+        if other.next > self.next && other.next - self.next <= MAX_ANNOUNCED_JUMP {
             self.extend(other.next.previous(), other.next, now, settled);
         }
         for number in self
@@ -348,7 +348,7 @@ impl Sequence {
         let decided = self.settled.max(self.available).max(self.floor());
         self.complete = self.complete.max(decided);
         while self.complete < self.next
-            && (self.received.get(self.complete) || self.excused.get(self.complete))
+            && (self.received.get(self.complete) || self.irrelevant.get(self.complete))
         {
             self.complete += 1;
         }
@@ -409,7 +409,7 @@ impl Sequence {
         let due = self
             .checkpoints
             .back()
-            .is_none_or(|(at, next)| *next < self.next && *at + window / STEPS <= now);
+            .is_none_or(|(at, next)| *next < self.next && *at + window / SETTLING_STEPS <= now);
         if due && self.settled < self.next {
             self.checkpoints.push_back((now, self.next));
         }
@@ -437,7 +437,7 @@ impl Sequence {
             complete: number,
             incarnation: self.incarnation.wrapping_add(1),
             received: Bitmap::with_len(MIN_WINDOW),
-            excused: Bitmap::with_len(MIN_WINDOW),
+            irrelevant: Bitmap::with_len(MIN_WINDOW),
             ..Self::default()
         };
     }
@@ -458,7 +458,7 @@ impl Sequence {
         if undecided > self.received.len() && self.received.len() < MAX_WINDOW {
             let len = undecided.next_power_of_two().min(MAX_WINDOW);
             self.received.grow(len, self.floor(), self.next);
-            self.excused.grow(len, self.floor(), self.next);
+            self.irrelevant.grow(len, self.floor(), self.next);
             if let Some(mut elsewhere) = self.elsewhere.take() {
                 elsewhere.grow(len, self.floor(), self.next);
                 self.elsewhere = Some(elsewhere);
@@ -474,7 +474,7 @@ impl Sequence {
             }
         }
         self.received.clear(self.next, end);
-        self.excused.clear(self.next, end);
+        self.irrelevant.clear(self.next, end);
         if let Some(elsewhere) = &mut self.elsewhere {
             elsewhere.clear(self.next, end);
         }
@@ -502,7 +502,7 @@ impl Sequence {
             .iter()
             .rev()
             .find(|gap| gap.start <= number && number < gap.end);
-        let late = |gap: &Gap| gap.requested || now - gap.noticed >= REORDERING;
+        let late = |gap: &Gap| gap.requested || now - gap.noticed >= MAX_REORDERING;
         match repair_mode {
             RepairMode::BestEffort => false,
             // A gap that is no longer remembered is an old one.
@@ -514,8 +514,8 @@ impl Sequence {
     fn settle(&mut self, limit: SequenceNumber, settled: &mut impl FnMut(Settled)) {
         for number in self.settled.until(limit.min(self.next)) {
             if !self.received.get(number) {
-                let excused = self.excused.get(number);
-                settled(if excused {
+                let is_irrelevant = self.irrelevant.get(number);
+                settled(if is_irrelevant {
                     Settled::Irrelevant(number)
                 } else {
                     Settled::Lost(number)

@@ -22,7 +22,7 @@ mod submessages;
 
 use ros2probe_wire::{Guid, SequenceNumber};
 
-use crate::facts::header::PLAUSIBLE;
+use crate::facts::header::MAX_PLAUSIBLE_OFFSET;
 use crate::facts::journal::Journal;
 use crate::facts::loss_share::LossShare;
 use crate::facts::measurement::Breakdown;
@@ -40,9 +40,9 @@ use crate::measure::samples::Budget;
 use crate::measure::topic::{Topic, TopicId};
 
 /// Maximum number of samples that one call compares with other deliveries.
-const LOOK_BACK: u64 = 4096;
+const MAX_COMPARED_SAMPLES: u64 = 4096;
 /// Maximum UDP payload of one Ethernet frame over IPv4. Larger datagrams need IP reassembly.
-const ONE_FRAME: u16 = 1472;
+const FRAME_BYTES: u16 = 1472;
 
 /// All receivers and destinations of one writer.
 #[derive(Debug, Default)]
@@ -128,7 +128,7 @@ impl Subscribers {
     pub fn missed(&mut self, destination: Destination, at: ModelTime) -> bool {
         let mut is_affected = false;
         for delivery in &mut self.deliveries {
-            if delivery.main().destination == destination {
+            if delivery.main_route().destination == destination {
                 delivery.interrupt(at);
                 is_affected = true;
             }
@@ -189,7 +189,7 @@ impl Subscribers {
         }
         let head = observation.head();
         let is_host = head.is_at_socket();
-        self.reassembled |= is_host && head.datagram_len > ONE_FRAME;
+        self.reassembled |= is_host && head.datagram_len > FRAME_BYTES;
         let route = head.route();
         match observation {
             Observation::Sample(_) => {}
@@ -208,7 +208,7 @@ impl Subscribers {
             known.last_seen = known.last_seen.max(context.now);
             if is_host && !known.at_socket {
                 known.at_socket = true;
-                self.uncover(route, context);
+                self.drop_wire_routes(route, context);
                 index = self.routes.find(&route).unwrap_or(index);
             }
         }
@@ -247,7 +247,7 @@ impl Subscribers {
         // Both times are from one clock. A sample that leaves before its timestamp, or hours after
         // it, is not a measure of the send delay.
         if let Some(source) = source.filter(|_| sample.is_start())
-            && (source..=source + PLAUSIBLE).contains(&began)
+            && (source..=source + MAX_PLAUSIBLE_OFFSET).contains(&began)
             && self.departures.is_first(source)
         {
             let delay = began.nanoseconds_since(source);
@@ -397,13 +397,13 @@ impl Subscribers {
             known.has_data = true;
         }
         if let Some(whole) = whole {
-            self.came(index, place, &whole, context.now);
+            self.note_arrival(index, place, &whole, context.now);
         }
         again
     }
 
     /// Processes a sample that arrived whole on this route.
-    fn came(&mut self, index: usize, place: usize, whole: &CompleteSample, now: ModelTime) {
+    fn note_arrival(&mut self, index: usize, place: usize, whole: &CompleteSample, now: ModelTime) {
         let withheld = self.deliveries.get(place).map(Delivery::is_withheld);
         let is_counted = withheld == Some(false);
         if is_counted {
@@ -413,8 +413,8 @@ impl Subscribers {
             return;
         };
         let route = known.route;
-        known.brought += u64::from(whole.newest);
-        let brought = known.brought;
+        known.new_samples += u64::from(whole.newest);
+        let brought = known.new_samples;
         if let Some(left) = self.departures.find(whole.number, route.destination)
             && now >= left
             && is_counted
@@ -425,10 +425,10 @@ impl Subscribers {
         let Some(delivery) = self.deliveries.get_mut(place) else {
             return;
         };
-        if delivery.main() != route {
-            let main = self.routes.find(&delivery.main());
+        if delivery.main_route() != route {
+            let main = self.routes.find(&delivery.main_route());
             let main = main.and_then(|index| self.routes.get(index));
-            if main.is_none_or(|main| main.brought < brought) {
+            if main.is_none_or(|main| main.new_samples < brought) {
                 delivery.move_to(route);
             }
         }
@@ -441,7 +441,7 @@ impl Subscribers {
         let mut is_known = false;
         for delivery in self.deliveries.iter_mut().filter(|each| is_open(each)) {
             is_known |= delivery.next() > number;
-            if delivery.misses(number) {
+            if delivery.is_missing(number) {
                 delivery.sample(
                     sample,
                     &mut delivery_context(&mut self.totals, self.reassembled, context),
@@ -460,7 +460,7 @@ impl Subscribers {
             && !route.destination.is_multicast()
             && self.find(receiver).is_none()
             && self.deliveries.iter().any(|delivery| {
-                is_at_socket(delivery.main()) && delivery.next() > sample.sequence_number
+                is_at_socket(delivery.main_route()) && delivery.next() > sample.sequence_number
             })
     }
 
@@ -474,20 +474,24 @@ impl Subscribers {
                 return;
             };
             for other in &mut self.deliveries {
-                if !other.main().is_sent() && !is_open(other) && other.misses(number) {
+                if !other.main_route().is_sent() && !is_open(other) && other.is_missing(number) {
                     other.know(number, &mut self.totals);
                 }
             }
             return;
         }
-        let end = delivery.next().min(next.saturating_add(LOOK_BACK));
+        let end = delivery
+            .next()
+            .min(next.saturating_add(MAX_COMPARED_SAMPLES));
         if next == SequenceNumber::ZERO || end <= next + 1 {
             return;
         }
-        let missing = next.until(end).filter(|number| delivery.misses(*number));
+        let missing = next
+            .until(end)
+            .filter(|number| delivery.is_missing(*number));
         let has = |number: &SequenceNumber| {
             let mut others = self.deliveries.iter().filter(|each| is_open(each));
-            others.any(|other| other.misses(*number) || other.has(*number))
+            others.any(|other| other.is_missing(*number) || other.has(*number))
         };
         let known: Vec<_> = missing.filter(has).collect();
         if let Some(delivery) = self.deliveries.get_mut(place) {

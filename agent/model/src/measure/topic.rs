@@ -20,7 +20,7 @@ use crate::facts::selection::{RequestIds, SampleRequest};
 use crate::facts::watch::Watchlist;
 use crate::graph::discovery::Discovery;
 use crate::measure::delivery::Totals;
-use crate::measure::expectation::Judgement;
+use crate::measure::expectation::TopicEvaluation;
 
 /// Handle of a topic.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -55,7 +55,7 @@ pub struct Topic {
     /// Whether it is measured.
     pub watched: Watched,
     /// Indices of the watchlist entries that cover it, with the state of each.
-    pub judgements: Vec<(usize, Judgement)>,
+    pub judgements: Vec<(usize, TopicEvaluation)>,
     /// Requests for its samples; `None` without any.
     pub requested: Option<RequestIds>,
     /// Counts of writers that are no longer measured.
@@ -102,7 +102,7 @@ pub struct Topics {
     /// Topics among `vanished` that still count as measured.
     vanished_watched: BTreeSet<(ModelTime, TopicId)>,
     /// Measured topics that are not watched by exact name.
-    yielding: BTreeSet<TopicId>,
+    displaceable: BTreeSet<TopicId>,
     created: u64,
     watched: usize,
     /// Number of times that a watched or requested topic exceeded the cap.
@@ -171,7 +171,7 @@ impl Topic {
         totals: Option<&Totals>,
         departed: LossShare,
     ) {
-        self.loss.leave(departed);
+        self.loss.note_departed(departed);
         if let Some(totals) = totals {
             self.retired_totals.get_or_insert_default().add(totals);
         }
@@ -305,7 +305,7 @@ impl Topics {
 
     /// Keeps a topic of an observed process, even without an endpoint. Returns it and whether it is
     /// new; `None` if there are `cap` topics already.
-    pub fn hold(
+    pub fn keep_process_topic(
         &mut self,
         domain_id: DomainId,
         naming: &Naming,
@@ -334,7 +334,7 @@ impl Topics {
         Some((id, is_new))
     }
 
-    /// Ends [`Self::hold`]: the topic vanishes if it has no endpoint.
+    /// Ends [`Self::keep_process_topic`]: the topic vanishes if it has no endpoint.
     pub fn release(&mut self, id: TopicId, now: ModelTime) {
         let Some(topic) = self.topics.get_mut(&id).filter(|topic| topic.is_held) else {
             return;
@@ -375,20 +375,20 @@ impl Topics {
             Watched::No
         } else if before == Watched::Yes
             || self.watched < cap
-            || self.give_up_vanished(id, is_named)
+            || self.free_vanished_slot(id, is_named)
         {
             Watched::Yes
         } else {
-            displaced = is_named.then(|| self.displace()).flatten();
+            displaced = is_named.then(|| self.free_latest_slot()).flatten();
             displaced.map_or(Watched::Rejected, |_| Watched::Yes)
         };
         self.watched += usize::from(after == Watched::Yes);
         self.watched -= usize::from(before == Watched::Yes);
         self.rejected += u64::from(after == Watched::Rejected && before != Watched::Rejected);
         if after == Watched::Yes && !is_named {
-            self.yielding.insert(id);
+            self.displaceable.insert(id);
         } else {
-            self.yielding.remove(&id);
+            self.displaceable.remove(&id);
         }
         let topic = self.topics.get_mut(&id)?;
         if after == Watched::Yes && before != Watched::Yes {
@@ -408,7 +408,9 @@ impl Topics {
                 let before = std::mem::take(&mut topic.judgements);
                 let judged = |watch| {
                     let known = before.iter().find(|(other, _)| *other == watch);
-                    known.copied().unwrap_or((watch, Judgement::default()))
+                    known
+                        .copied()
+                        .unwrap_or((watch, TopicEvaluation::default()))
                 };
                 covering.into_iter().map(judged).collect()
             }
@@ -489,9 +491,9 @@ impl Topics {
 
     /// Frees the slot of the topic that vanished first. A topic watched by exact name keeps its
     /// slot unless the new topic is watched by exact name, too. Returns whether a slot was freed.
-    fn give_up_vanished(&mut self, keep: TopicId, is_named: bool) -> bool {
+    fn free_vanished_slot(&mut self, keep: TopicId, is_named: bool) -> bool {
         let places = || self.vanished_watched.iter().map(|(_, id)| *id);
-        let unnamed = places().find(|id| *id != keep && self.yielding.contains(id));
+        let unnamed = places().find(|id| *id != keep && self.displaceable.contains(id));
         let any = || places().find(|id| *id != keep && is_named);
         let Some(id) = unnamed.or_else(any) else {
             return false;
@@ -503,8 +505,8 @@ impl Topics {
 
     /// Frees the slot of the latest topic that is not watched by exact name, so that topics that
     /// were known before a flood stay.
-    fn displace(&mut self) -> Option<TopicId> {
-        let id = self.yielding.pop_last()?;
+    fn free_latest_slot(&mut self) -> Option<TopicId> {
+        let id = self.displaceable.pop_last()?;
         let topic = self.topics.get_mut(&id)?;
         (topic.watched, topic.requested) = (Watched::Rejected, None);
         topic.judgements.clear();
@@ -514,7 +516,7 @@ impl Topics {
     }
 
     fn forget(&mut self, id: TopicId) {
-        self.yielding.remove(&id);
+        self.displaceable.remove(&id);
         if let Some(topic) = self.topics.remove(&id) {
             self.watched -= usize::from(topic.watched == Watched::Yes);
             if let Some(at) = topic.vanished {

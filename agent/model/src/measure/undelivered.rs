@@ -15,9 +15,9 @@ use crate::facts::tables::UndeliveredParts;
 use ros2probe_wire::SequenceNumber;
 
 /// Maximum difference between the clock conversions of the two reports.
-const SLACK: Duration = Duration::from_micros(100);
+const MAX_CLOCK_DIFFERENCE: Duration = Duration::from_micros(100);
 /// An arrival follows its drop within this time, or the record of the arrival was lost.
-const LIFETIME: Duration = Duration::from_secs(60);
+const DROP_LIFETIME: Duration = Duration::from_secs(60);
 
 /// Drops at one receiver that wait for the report of their arrival.
 #[derive(Debug, Default)]
@@ -77,8 +77,8 @@ impl Undelivered {
         self.waiting.retain_mut(|each| {
             let is_meant = each.socket == sample.head.socket
                 && each.number == sample.sequence_number
-                && each.last + SLACK >= begin
-                && each.first <= end + SLACK;
+                && each.last + MAX_CLOCK_DIFFERENCE >= begin
+                && each.first <= end + MAX_CLOCK_DIFFERENCE;
             if !is_meant {
                 return true;
             }
@@ -120,7 +120,7 @@ impl Undelivered {
     /// Removes entries whose arrival did not follow.
     pub fn expire(&mut self, now: ModelTime) {
         while let Some(oldest) = self.waiting.front()
-            && oldest.last + LIFETIME <= now
+            && oldest.last + DROP_LIFETIME <= now
         {
             self.waiting.pop_front();
         }
@@ -225,7 +225,7 @@ mod tests {
             ranges(&delivered(&mut undelivered, &later, &mut 0)),
             [(3, 4)]
         );
-        undelivered.expire(ModelTime::from_nanoseconds(13 * MILLISECOND) + LIFETIME);
+        undelivered.expire(ModelTime::from_nanoseconds(13 * MILLISECOND) + DROP_LIFETIME);
         assert!(undelivered.is_empty());
     }
 

@@ -25,14 +25,14 @@ use crate::measure::in_order::Progress;
 use crate::measure::reception::{Decision, Outcome, Reception};
 use crate::measure::sampled::Sampled;
 use crate::measure::samples::Budget;
-use crate::measure::sequence::{FAR, REACH};
+use crate::measure::sequence::{MAX_ANNOUNCED_JUMP, MAX_TRUSTED_JUMP};
 
 /// Time in which reordering may fill a gap of a best-effort writer.
 pub const BEST_EFFORT_WINDOW: Duration = Duration::from_secs(1);
 /// Time in which a reliable writer may retransmit: three HEARTBEAT periods of Fast DDS.
 pub const RELIABLE_WINDOW: Duration = Duration::from_secs(10);
 /// A first sample older than this is history that a late joiner requested.
-const HISTORY: Duration = Duration::from_secs(10);
+const MIN_HISTORY_AGE: Duration = Duration::from_secs(10);
 
 /// A uprobe's view of a writer stays exact for this long after its last observation: samples read
 /// from shared memory in that time were seen already.
@@ -195,7 +195,7 @@ impl Writer {
     }
 
     /// Counts a sample or fragment that arrived again on the same route.
-    pub const fn came_again(&mut self) {
+    pub const fn note_retransmission(&mut self) {
         self.tally.duplicates += 1;
     }
 
@@ -204,7 +204,7 @@ impl Writer {
     pub fn has(&self, sample: &Sample) -> bool {
         let (at, number) = (sample.head.at, sample.sequence_number);
         let sequence = self.reception.sequence();
-        if self.is_under_way(sample) {
+        if self.is_pending(sample) {
             return false;
         }
         if sample.head.is_polled() && self.is_exact(at) {
@@ -223,7 +223,7 @@ impl Writer {
     /// ones.
     pub const fn refuses(&mut self, acknack: &AckNack) -> bool {
         let sequence = self.reception.sequence_mut();
-        sequence.refuses(acknack.base())
+        sequence.is_too_far_ahead(acknack.base())
     }
 
     /// Returns the number of messages counted.
@@ -250,9 +250,9 @@ impl Writer {
     /// Returns how long the writer may seem silent while it sends, because polling misses messages.
     /// `slowest` is the assumed interval of its messages if it is not known.
     #[must_use]
-    pub fn seeming_silence(&self, slowest: Duration) -> Duration {
+    pub fn max_unseen_time(&self, slowest: Duration) -> Duration {
         let sampled = self.sampled.as_ref();
-        sampled.map_or(Duration::ZERO, |sampled| sampled.seeming_silence(slowest))
+        sampled.map_or(Duration::ZERO, |sampled| sampled.max_unseen_time(slowest))
     }
 
     /// Returns whether no view has shown any of its samples, or none since the uprobe's view ended.
@@ -281,7 +281,7 @@ impl Writer {
 
     /// Processes an observation of this writer and returns the message that it completed. `opened`
     /// is the time at which this host last began to see its samples; samples missing before that
-    /// are excused.
+    /// are irrelevant.
     pub fn observe(
         &mut self,
         observation: &Observation,
@@ -295,7 +295,7 @@ impl Writer {
             self.exact = self.exact.max(Some(at));
         }
         if let Observation::Sample(sample) = observation
-            && self.is_under_way(sample)
+            && self.is_pending(sample)
         {
             return self.catch_up(sample, context);
         }
@@ -313,7 +313,7 @@ impl Writer {
             });
         if is_sampled || takes {
             let counted = self.sampled_observation(observation, is_sampled, context);
-            self.leave_unseen(context.journal);
+            self.report_unseen(context.journal);
             if let Some(sampled) = self.sampled.as_mut().filter(|_| is_exact) {
                 // From now on, the uprobe sees every message.
                 sampled.end();
@@ -349,8 +349,8 @@ impl Writer {
         let (next, advanced) = before;
         let sequence = self.reception.sequence_mut();
         if next > SequenceNumber::ZERO && advanced < opened && sequence.next() > next {
-            // The newest sample is excused too, which has no effect once it is received.
-            sequence.excuse(next, sequence.next());
+            // The newest sample is marked irrelevant too, which has no effect once it is received.
+            sequence.mark_irrelevant(next, sequence.next());
         }
         counted
     }
@@ -402,7 +402,7 @@ impl Writer {
     pub fn advance(&mut self, context: &mut MeasurementContext<'_>) {
         if let Some(sampled) = &mut self.sampled {
             sampled.tick(context.now);
-            self.leave_unseen(context.journal);
+            self.report_unseen(context.journal);
         }
         let (now, window) = (context.now, settle_window(self.traits.reliable));
         let (reception, mut settling) =
@@ -417,7 +417,7 @@ impl Writer {
     pub fn settle_sampled(&mut self, context: &mut MeasurementContext<'_>) {
         if let Some(sampled) = &mut self.sampled {
             sampled.settle_all();
-            self.leave_unseen(context.journal);
+            self.report_unseen(context.journal);
         }
     }
 
@@ -590,7 +590,7 @@ impl Settling<'_> {
             return;
         };
         self.tally.incomplete += u64::from(incomplete);
-        self.journal.leave_missing(Missing {
+        self.journal.add_missing(Missing {
             writer: self.writer,
             first,
             last,
@@ -608,14 +608,18 @@ impl Settling<'_> {
             first,
             last,
         };
-        self.journal.lose(loss, self.has_receivers);
+        self.journal.add_loss(loss, self.has_receivers);
     }
 }
 
 /// Returns how far ahead the numbers of an observation may be. Polling shared memory misses more
 /// numbers.
 fn reach(head: &Head) -> u64 {
-    if head.is_polled() { FAR } else { REACH }
+    if head.is_polled() {
+        MAX_ANNOUNCED_JUMP
+    } else {
+        MAX_TRUSTED_JUMP
+    }
 }
 
 #[expect(

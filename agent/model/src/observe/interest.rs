@@ -45,7 +45,7 @@ impl Interest {
     pub fn set(&mut self, guid: Guid, verdict: Verdict) {
         if !self.entries.contains_key(&guid) && self.entries.len() >= self.limit {
             self.evictions += 1;
-            if verdict == Verdict::Ignore || !self.give_up_one() {
+            if verdict == Verdict::Ignore || !self.drop_ignored() {
                 return;
             }
         }
@@ -107,7 +107,7 @@ impl Interest {
 
     /// Drops one entry with [`Verdict::Ignore`], if possible one that the kernel does not have.
     /// Returns whether one was dropped.
-    fn give_up_one(&mut self) -> bool {
+    fn drop_ignored(&mut self) -> bool {
         let mut ignored = self
             .entries
             .iter()

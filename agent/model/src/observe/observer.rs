@@ -47,7 +47,7 @@ use crate::derive::services::Services;
 use crate::derive::stamps::Stamps;
 use crate::derive::trace::{Tracer, WriterDescription};
 use crate::derive::type_descriptions::TypeDescriptions;
-use crate::facts::event::TEXT;
+use crate::facts::event::MAX_TEXT;
 use crate::facts::journal::Journal;
 use crate::facts::measurement::Measurement;
 use crate::facts::model_time::ModelTime;
@@ -68,7 +68,7 @@ use crate::measure::topic::{Accelerated, TopicId, Topics, Watched};
 use crate::observe::input::{Captured, Input, NewLog, Output};
 use crate::observe::interest::Interest;
 use crate::report::snapshot::Snapshot;
-use crate::report::transport::{lacks_names, may_share_memory};
+use crate::report::transport::{has_missing_names, may_share_memory};
 use lists::{traced_share, traits};
 use references::{CountedAs, References};
 pub use settings::Settings;
@@ -77,7 +77,7 @@ use zenoh::ZenohNames;
 /// Interval at which leases, windows and gaps are checked.
 const TICK: Duration = Duration::from_millis(100);
 /// A larger step of the clock means that the clock was set; it is not processed tick by tick.
-const JUMP: Duration = Duration::from_secs(3600);
+const MAX_CLOCK_STEP: Duration = Duration::from_secs(3600);
 /// Maximum number of names matched against globs per round, which takes a few milliseconds.
 const MAX_MATCHES_PER_ROUND: usize = 20_000;
 
@@ -256,7 +256,7 @@ impl Observer {
             Input::SharedMemoryGap(now) => self
                 .measure
                 .profiler
-                .uncertain(self.graph.wall_clock.model_time(now)),
+                .note_uncertain(self.graph.wall_clock.model_time(now)),
             Input::StreamGap(destination, at) => {
                 let at = self.graph.wall_clock.model_time(at);
                 self.measure.profiler.missed(destination, at);
@@ -270,7 +270,7 @@ impl Observer {
             Input::Observation(observation) => self.observe(observation),
             Input::ParticipantAlive(prefix, at) => {
                 let at = self.graph.wall_clock.model_time(at);
-                self.graph.discovery.seen(prefix, at, Priority::NOTHING);
+                self.graph.discovery.seen(prefix, at, Priority::NO_EVIDENCE);
             }
             Input::Socket(facts) => self.graph.receivers.socket(facts),
             Input::SocketsRead => self.link_sessions(),
@@ -285,7 +285,7 @@ impl Observer {
             Input::ExpectedChains(chains) => self.derive.chains.expect(chains),
             Input::SharedMemoryUsed(memory) => self.derive.robot.use_shared_memory(&memory),
             Input::RobotExpectations(expected) => self.derive.robot.expect(expected),
-            Input::CausalPublication(publication) => self.chain_published(publication),
+            Input::CausalPublication(publication) => self.add_causal_publication(publication),
             Input::Restored { memory, now } => {
                 self.restore(memory, self.graph.wall_clock.model_time(now));
             }
@@ -328,8 +328,8 @@ impl Observer {
 
     /// Returns whether a subscription requests payloads.
     #[must_use]
-    pub const fn wants_payloads(&self) -> bool {
-        self.measure.payloads.wants_any_bytes()
+    pub const fn needs_payloads(&self) -> bool {
+        self.measure.payloads.needs_any_payload()
     }
 
     /// Returns whether so much output waits that it should be drained before further input.
@@ -344,7 +344,7 @@ impl Observer {
     #[must_use]
     pub fn wanted_of_shared_memory(&self) -> Wanted {
         let may_share = |guid: &Guid| may_share_memory(&self.graph.discovery, *guid);
-        if self.measure.payloads.wanted().any(may_share) || self.awaits_writers() {
+        if self.measure.payloads.requested_writers().any(may_share) || self.awaits_writers() {
             Wanted::EverySample
         } else if self
             .measure
@@ -353,7 +353,7 @@ impl Observer {
             .any(|(guid, _)| may_share(guid))
         {
             Wanted::Samples
-        } else if lacks_names(&self.graph.discovery, self.clock) {
+        } else if has_missing_names(&self.graph.discovery, self.clock) {
             Wanted::Names
         } else {
             Wanted::Nothing
@@ -364,8 +364,9 @@ impl Observer {
     /// message of such a writer must not be missed.
     fn awaits_writers(&self) -> bool {
         let mut requests = self.requested.sample_requests.iter();
-        requests
-            .any(|request| request.selection.is_open() || !self.measure.payloads.serves(request.id))
+        requests.any(|request| {
+            request.selection.is_open() || !self.measure.payloads.has_request(request.id)
+        })
     }
 
     /// Processes a truncated datagram of a capture file: submessage headers count, payloads are not
@@ -385,17 +386,17 @@ impl Observer {
     }
 
     /// Records that the participant that sent this RTPS message uses TCP, if the message came so.
-    fn note_tcp(&mut self, envelope: &Envelope, payload: &[u8]) {
+    fn note_tcp_sender(&mut self, envelope: &Envelope, payload: &[u8]) {
         if envelope.logical_port != 0
             && let Some(prefix) = payload.get(8..20)
             && let Ok(prefix) = prefix.try_into()
         {
-            self.graph.discovery.came_by_tcp(GuidPrefix(prefix));
+            self.graph.discovery.note_tcp(GuidPrefix(prefix));
         }
     }
 
     fn message_beginning(&mut self, envelope: &Envelope, payload: &[u8], length: u32) {
-        self.note_tcp(envelope, payload);
+        self.note_tcp_sender(envelope, payload);
         let outcome = walk::beginning(payload, length, envelope, |found| {
             let clock = self.graph.wall_clock;
             Observation::each(&found.record, clock, |observation| {
@@ -429,7 +430,7 @@ impl Observer {
             topic: &endpoint.topic,
         });
         self.zenoh.restore(&memory.zenoh, endpoints, now);
-        self.follow_up(now);
+        self.apply_discovery_changes(now);
     }
 
     /// Returns the discovery state to save for the next start.
@@ -483,12 +484,12 @@ impl Observer {
         let writer = observation.head().writer;
         if matches!(observation, Observation::Presence(_)) {
             let (sender, at) = (observation.sender(), observation.head().at);
-            self.graph.discovery.seen(sender, at, Priority::NOTHING);
+            self.graph.discovery.seen(sender, at, Priority::NO_EVIDENCE);
             return;
         }
         self.renew_lease(observation);
         self.compare_clocks(observation);
-        self.judge_stamp(observation);
+        self.check_stamp(observation);
         if writer.entity.is_builtin() {
             return;
         }
@@ -512,9 +513,9 @@ impl Observer {
                 // A router's socket sends samples of many sessions.
                 Path::Stream { .. } => self.graph.receivers.is_local(&sender),
                 Path::Wire | Path::SharedMemory { .. }
-                    if self.settings.directed && head.leaves() =>
+                    if self.settings.directed && head.is_outgoing() =>
                 {
-                    self.graph.receivers.found_here(sender)
+                    self.graph.receivers.note_local(sender)
                 }
                 _ => self.graph.receivers.learn(observation),
             },
@@ -525,7 +526,7 @@ impl Observer {
             if self.graph.discovery.learn(sender, evidence, at, journal) {
                 self.announce(sender);
             }
-            self.follow_up(at);
+            self.apply_discovery_changes(at);
         }
     }
 
@@ -561,23 +562,23 @@ impl Observer {
         // ordinary topics skip this lookup.
         let measures_calls = self.derive.services.has_measured();
         if let Some(sample) = sample.filter(|_| measures_calls) {
-            self.call_seen(sample);
+            self.count_call(sample);
         }
         let journal = &mut self.journal;
         match (self.measure.profiler).observe(observation, journal, &self.graph) {
             ObservationOutcome::Unmeasured => {
                 if let Some(sample) = sample.filter(|_| !measures_calls) {
-                    self.call_seen(sample);
+                    self.count_call(sample);
                 }
                 self.measure_unknown_writer(observation);
             }
             ObservationOutcome::Measured => {
                 if let Some(sample) = sample {
-                    self.chain_seen(sample, None);
+                    self.add_to_chains(sample, None);
                 }
                 if self.measure.payloads.is_unsettled(writer) {
                     if let Some(sample) = sample {
-                        self.came_again(sample);
+                        self.note_retransmitted(sample);
                     }
                     self.turn(writer, observation.head().at);
                 }
@@ -585,7 +586,7 @@ impl Observer {
             ObservationOutcome::Counted(counted) => {
                 self.report_missing();
                 if let Some(sample) = sample {
-                    self.chain_seen(sample, Some(&counted));
+                    self.add_to_chains(sample, Some(&counted));
                 }
                 self.counted(writer, &counted);
             }
@@ -620,8 +621,8 @@ impl Observer {
             let topic = topics.get(topics.find(endpoint.domain_id, &naming)?)?;
             let subject = WriterDescription {
                 domain_id: topic.domain_id,
-                topic: topic.naming.name.bounded(TEXT),
-                message_type: endpoint.message_type.bounded(TEXT),
+                topic: topic.naming.name.bounded(MAX_TEXT),
+                message_type: endpoint.message_type.bounded(MAX_TEXT),
                 reliable: traits(writer, endpoint).reliable,
             };
             (topic.watched == Watched::Yes).then(|| (subject, traced_share(topic, watchlist)))
@@ -630,7 +631,7 @@ impl Observer {
 
     /// Reads the announcements and payloads of a datagram, and observes every submessage.
     fn walk(&mut self, captured: Captured<'_>, payload: &[u8], handover: Option<&Handover>) {
-        self.note_tcp(captured.envelope, payload);
+        self.note_tcp_sender(captured.envelope, payload);
         let outcome = walk::datagram(payload, captured.envelope, handover, |found| {
             self.submessage(captured, &found, UserData::Here);
         });
@@ -649,7 +650,7 @@ impl Observer {
             }
         };
         match captured.is_polled {
-            true => Observation::each_polled(&found.record, clock, observe),
+            true => Observation::for_each_polled(&found.record, clock, observe),
             false => Observation::each(&found.record, clock, observe),
         }
     }
@@ -662,7 +663,7 @@ impl Observer {
     }
 
     /// Applies changes of discovery to topics, interest and measurement.
-    fn follow_up(&mut self, now: ModelTime) {
+    fn apply_discovery_changes(&mut self, now: ModelTime) {
         for change in self.graph.discovery.changes() {
             self.graph.receivers.changed();
             match change {
@@ -683,7 +684,7 @@ impl Observer {
                         self.find_references(topic);
                     }
                 }
-                Change::Gone(guid, endpoint) => self.gone(guid, &endpoint, now),
+                Change::Gone(guid, endpoint) => self.remove_discovered(guid, &endpoint, now),
             }
         }
     }
@@ -727,7 +728,7 @@ impl Observer {
         }
     }
 
-    fn gone(&mut self, guid: Guid, endpoint: &Endpoint, now: ModelTime) {
+    fn remove_discovered(&mut self, guid: Guid, endpoint: &Endpoint, now: ModelTime) {
         self.requested.interest.remove(guid);
         self.derive.services.forget(guid);
         self.derive.tracer.forget(guid);
@@ -738,7 +739,7 @@ impl Observer {
         self.derive.stamps.forget(guid);
         self.derive.clocks.forget(guid);
         self.references.remove(guid);
-        let (domain_id, topic) = (endpoint.domain_id, endpoint.topic.bounded(TEXT));
+        let (domain_id, topic) = (endpoint.domain_id, endpoint.topic.bounded(MAX_TEXT));
         self.journal.events.name(guid, domain_id, &topic);
         let id = endpoint
             .naming()

@@ -261,7 +261,7 @@ pub struct TopicFacts {
 }
 
 /// Number of intervals after which a topic counts as sent regularly.
-const REGULAR: u64 = 10;
+const MIN_REGULAR_INTERVALS: u64 = 10;
 
 /// Transport between a writer and a reader, as both announce it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -413,7 +413,7 @@ impl TopicFacts {
         else {
             return false;
         };
-        let is_regular = measured.interarrival.count() >= REGULAR;
+        let is_regular = measured.interarrival.count() >= MIN_REGULAR_INTERVALS;
         let silence = (now - last).as_secs_f64();
         self.rate_hz() == Some(0.0) && is_regular && silence >= longest * 5.0
     }

@@ -95,7 +95,7 @@ pub(crate) fn is_polled(discovery: &Discovery, writer: Guid, readers: &[Guid]) -
 
 /// Returns whether names are missing that shared memory may contain at present: nodes of a
 /// participant, or the node of an endpoint.
-pub(crate) fn lacks_names(discovery: &Discovery, now: ModelTime) -> bool {
+pub(crate) fn has_missing_names(discovery: &Discovery, now: ModelTime) -> bool {
     let is_new = |first_seen: ModelTime, within: Duration| first_seen + within > now;
     let participants = discovery.participants();
     participants.values().any(|participant| {

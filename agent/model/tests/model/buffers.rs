@@ -161,7 +161,7 @@ fn each_of_two_publishers_in_a_process_has_its_own_cpu_topic() {
 }
 
 #[test]
-fn a_change_from_the_cpu_topic_to_the_topic_itself_loses_nothing() {
+fn a_change_from_the_cpu_topic_to_the_base_topic_loses_no_message() {
     let (mut host, bob) = robot(CPU);
     publish(&mut host, bob, writer(0x22), 1..=10);
     publish(&mut host, bob, writer(0x21), 1..=5);
@@ -189,7 +189,7 @@ fn references_count_only_while_no_subscription_gets_messages() {
 }
 
 #[test]
-fn participants_with_one_machine_id_are_on_one_host_whatever_their_guids_say() {
+fn participants_with_one_machine_id_are_on_one_host_despite_different_guids() {
     let machine = |host: &mut Host, prefix: GuidPrefix, number, id: &str| {
         let list = forge::participant_on(prefix, id, [10, 0, 0, 1]);
         host.announce(Message::from_fast(prefix).data(forge::SPDP, number, &list));
@@ -214,8 +214,8 @@ fn participants_with_one_machine_id_are_on_one_host_whatever_their_guids_say() {
     }
 }
 
-/// A subscription in the publisher's process gets its references there, so that only those to another
-/// one are visible.
+/// A subscription in the publisher's process gets its references there, so that only those to
+/// another one are visible.
 #[test]
 fn references_count_whichever_subscription_gets_them_and_once() {
     let (mut host, bob) = robot(CUDA);
@@ -260,7 +260,7 @@ fn on_machine(host: &mut Host, number: u8, in_guid: u8, id: &str, address: [u8; 
 }
 
 #[test]
-fn cloned_machines_are_a_finding_and_participants_of_one_host_are_none() {
+fn cloned_machines_are_a_finding_and_participants_of_one_host_are_not() {
     let apart = |participants: &[(u8, &str, [u8; 4])]| {
         let mut host = Host::new();
         for (number, (in_guid, id, address)) in participants.iter().enumerate() {

@@ -21,7 +21,7 @@ const ALIVE: u32 = 60;
 struct Robot {
     observer: Observer,
     now: u64,
-    born: u32,
+    created: u32,
 }
 
 impl Robot {
@@ -42,9 +42,9 @@ impl Robot {
     /// Adds a participant with a new name that sends data, and removes another. Every second one is
     /// removed by its expired lease.
     fn step(&mut self) {
-        let number = self.born;
+        let number = self.created;
         let prefix = Self::prefix(number);
-        self.born += 1;
+        self.created += 1;
         let announcement = forge::participant(prefix, 4, None);
         self.put(Message::from(prefix).data(SPDP, 1, &announcement));
         let own = format!("rt/robot_{number}/points");
@@ -84,7 +84,7 @@ impl Robot {
     }
 
     /// Returns the bytes held after this many more participants.
-    fn held_after(&mut self, more: u32) -> usize {
+    fn bytes_after(&mut self, more: u32) -> usize {
         (0..more).for_each(|_| self.step());
         let snapshot = self.observer.snapshot(Timestamp(self.now));
         let alive = snapshot.participants.len();
@@ -109,10 +109,10 @@ fn thousands_of_participants_that_left_leave_no_state() {
     let mut robot = Robot {
         observer,
         now: START,
-        born: 0,
+        created: 0,
     };
-    robot.held_after(14_000);
-    let held: Vec<_> = (0..4).map(|_| robot.held_after(1_000)).collect();
+    robot.bytes_after(14_000);
+    let held: Vec<_> = (0..4).map(|_| robot.bytes_after(1_000)).collect();
     let (least, most) = (held.iter().min().unwrap(), held.iter().max().unwrap());
     // The bound is less than 7 bytes for each of the 3000 participants that left in between.
     assert!(most - least < 20_000, "{held:?}");

@@ -20,7 +20,7 @@ const MICROSECOND: u64 = 1_000;
 const MILLISECOND: u64 = 1_000_000;
 const SECOND: u64 = 1_000_000_000;
 /// Fastest way of a datagram between the hosts.
-const WAY: u64 = 150 * MICROSECOND;
+const TRANSIT: u64 = 150 * MICROSECOND;
 
 /// Alice's clock beside that of this host, on which Bob is.
 #[derive(Clone, Copy)]
@@ -84,11 +84,11 @@ impl Pair {
     }
 
     /// A message of Alice's leaves now by its stamp, and arrives.
-    fn hear(&mut self, clock: Clock) {
+    fn receive_from_alice(&mut self, clock: Clock) {
         let sent = self.host.now;
         self.number += 1;
         let stamp = sent.checked_add_signed(clock.at(sent)).unwrap();
-        let late = WAY + self.jitter(2 * MILLISECOND);
+        let late = TRANSIT + self.jitter(2 * MILLISECOND);
         let record = Record {
             writer: guid_words(Guid::new(self.alice, WRITER)),
             source_timestamp: wire_time(stamp),
@@ -101,16 +101,16 @@ impl Pair {
     /// Ten messages of Alice's arrive each second.
     fn listen(&mut self, clock: Clock, seconds: u64) {
         for _ in 0..10 * seconds {
-            self.hear(clock);
+            self.receive_from_alice(clock);
             self.until(self.host.now + SECOND / 10);
         }
     }
 
     /// A message of Bob's leaves, and Alice acknowledges it.
-    fn speak(&mut self) {
+    fn send_from_bob(&mut self) {
         let sent = self.host.now;
         self.send(kind::DATA, sent);
-        let later = 2 * WAY + 20 * MICROSECOND + self.jitter(5 * MILLISECOND);
+        let later = 2 * TRANSIT + 20 * MICROSECOND + self.jitter(5 * MILLISECOND);
         self.acknowledge(sent + later);
     }
 
@@ -143,8 +143,8 @@ impl Pair {
     fn talk(&mut self, clock: Clock, seconds: u64, mut check: impl FnMut(&Self)) {
         for second in 0..seconds {
             for _ in 0..50 {
-                self.hear(clock);
-                self.speak();
+                self.receive_from_alice(clock);
+                self.send_from_bob();
                 self.until(self.host.now + 20 * MILLISECOND);
             }
             if second >= 5 {
@@ -199,7 +199,7 @@ fn wire_time(nanoseconds: u64) -> u64 {
 }
 
 #[test]
-fn an_offset_lies_within_its_bound_also_while_clocks_drift() {
+fn an_offset_is_within_its_bound_while_clocks_drift() {
     for ahead in [0, 500_000, 20_000_000, 3_000_000_000, -20_000_000] {
         for parts_per_million in [0, 50, -50] {
             let clock = Clock {
@@ -223,11 +223,11 @@ fn an_offset_lies_within_its_bound_also_while_clocks_drift() {
 }
 
 #[test]
-fn one_direction_gives_one_bound_and_no_offset() {
+fn one_direction_yields_one_bound_and_no_offset() {
     let mut pair = Pair::new();
     let clock = Clock::ahead(20_000_000);
     for _ in 0..500 {
-        pair.hear(clock);
+        pair.receive_from_alice(clock);
         pair.until(pair.host.now + 20 * MILLISECOND);
     }
     let peer = pair.peer();
@@ -240,28 +240,28 @@ fn one_direction_gives_one_bound_and_no_offset() {
     assert!(pair.offsets().is_empty() && pair.finding().is_none());
     // Acknowledgements without stamps give none, either.
     let mut pair = Pair::new();
-    (0..500).for_each(|_| pair.speak());
+    (0..500).for_each(|_| pair.send_from_bob());
     assert_eq!(pair.host.snapshot().clocks.peers, []);
 }
 
 #[test]
-fn few_messages_and_repetitions_are_no_evidence_for_a_round_trip() {
+fn few_or_repeated_messages_are_not_evidence_of_a_round_trip() {
     let mut pair = Pair::new();
-    pair.speak();
+    pair.send_from_bob();
     for _ in 0..10 {
-        pair.hear(Clock::ahead(0));
-        pair.speak();
+        pair.receive_from_alice(Clock::ahead(0));
+        pair.send_from_bob();
     }
     assert_eq!(
         pair.peer().ahead.1,
         None,
         "one of ten may not be as fast as a round trip"
     );
-    (0..20).for_each(|_| pair.hear(Clock::ahead(0)));
+    (0..20).for_each(|_| pair.receive_from_alice(Clock::ahead(0)));
     let (_, uncertainty) = pair.offset();
     // The last message is sent again just before an acknowledgement of its first transmission.
     pair.number -= 1;
-    pair.speak();
+    pair.send_from_bob();
     pair.until(pair.host.now + SECOND);
     assert!(pair.offset().1 >= uncertainty);
 }
@@ -270,12 +270,12 @@ fn few_messages_and_repetitions_are_no_evidence_for_a_round_trip() {
 fn one_acknowledgement_is_a_round_trip_for_ten_minutes() {
     let mut pair = Pair::new();
     // Alice is unknown as a peer until her first message.
-    pair.speak();
+    pair.send_from_bob();
     let clock = Clock::ahead(3 * MILLISECOND as i64);
     let mut hear_for = |seconds: u64| {
         for _ in 0..seconds * 10 {
             pair.until(pair.host.now + SECOND / 10);
-            pair.hear(clock);
+            pair.receive_from_alice(clock);
         }
         pair.offsets()
     };
@@ -460,7 +460,7 @@ fn pairs_of_peers_follow_from_differences() {
 
 /// Alice's server replies to requests of Bob's client. The reply is stamped when it is written.
 #[test]
-fn replies_bound_the_offset_whatever_the_network_does() {
+fn replies_bound_the_offset_at_any_network_delay() {
     const REQUESTS: EntityId = EntityId([0, 0, 0x21, 0x03]);
     const REPLIES: EntityId = EntityId([0, 0, 0x22, 0x03]);
     const TYPE: &str = "example_interfaces::srv::dds_::AddTwoInts_Request_";
@@ -494,7 +494,7 @@ fn replies_bound_the_offset_whatever_the_network_does() {
         let request = Message::from(BOB);
         send(REQUESTS, true, sent, request);
         // The way there is fast, the way back slow.
-        let replied = sent + WAY + 300 * MICROSECOND;
+        let replied = sent + TRANSIT + 300 * MICROSECOND;
         let stamp = replied.checked_add_signed(clock.at(replied)).unwrap();
         let reply = Message::from(ALICE).info_ts(stamp);
         send(REPLIES, false, replied + 3 * MILLISECOND, reply);
@@ -529,7 +529,7 @@ fn tables_of_peers_and_writers_are_bounded() {
         pair.alice = GuidPrefix(prefix[..12].try_into().unwrap());
         let address = SocketAddrV4::new([10, 0, 1, number].into(), 7411);
         pair.host.participant(pair.alice, address);
-        pair.hear(Clock::ahead(0));
+        pair.receive_from_alice(Clock::ahead(0));
     }
     assert_eq!(pair.host.snapshot().clocks.peers.len(), ClockPeers::CAP);
     for number in 0..2 * ClockWriters::CAP as u32 {

@@ -52,7 +52,7 @@ impl Robot {
     }
 
     /// Sends this level once a second.
-    fn go_on(&mut self, level: u8, seconds: u64) {
+    fn publish_for(&mut self, level: u8, seconds: u64) {
         for second in 0..seconds {
             self.say(level, &format!("message {second}"));
             self.domain.wait(1000);
@@ -123,7 +123,7 @@ fn the_last_status_of_each_part_is_kept_with_its_values_and_node() {
 }
 
 #[test]
-fn a_change_of_level_is_one_event_and_the_first_ok_is_none() {
+fn a_change_of_level_is_one_event_and_the_first_ok_is_no_event() {
     let mut robot = Robot::new();
     for level in [0, 0, 1, 1, 2, 3, 0] {
         robot.say(level, "text");
@@ -138,30 +138,30 @@ fn a_change_of_level_is_one_event_and_the_first_ok_is_none() {
 #[test]
 fn an_error_of_five_seconds_is_a_finding_until_it_ends() {
     let mut robot = Robot::new();
-    robot.go_on(2, 4);
+    robot.publish_for(2, 4);
     assert_eq!(robot.findings(), []);
-    robot.go_on(2, 5);
+    robot.publish_for(2, 5);
     // The message is that of the report, so that the finding does not change each second.
     let reported = robot.findings();
     assert_eq!(reported.len(), 1);
-    robot.go_on(2, 5);
+    robot.publish_for(2, 5);
     assert_eq!(robot.findings(), reported);
-    robot.go_on(0, 2);
+    robot.publish_for(0, 2);
     assert_eq!(robot.findings(), []);
 }
 
 #[test]
-fn a_start_up_in_error_and_a_warning_are_no_findings() {
+fn errors_during_start_up_and_warnings_are_not_findings() {
     let mut robot = Robot::new();
-    robot.go_on(2, 4);
-    robot.go_on(1, 60);
+    robot.publish_for(2, 4);
+    robot.publish_for(1, 60);
     assert_eq!(robot.findings(), []);
 }
 
 #[test]
-fn a_part_whose_messages_cease_becomes_stale_and_then_a_finding() {
+fn a_silent_diagnostic_part_becomes_stale_and_then_a_finding() {
     let mut robot = Robot::new();
-    robot.go_on(0, 10);
+    robot.publish_for(0, 10);
     (0..4).for_each(|_| robot.domain.wait(1000));
     assert_eq!(robot.only().level, Ok);
     (0..3).for_each(|_| robot.domain.wait(1000));
@@ -189,9 +189,9 @@ fn a_part_that_publishes_every_forty_seconds_is_never_stale() {
 }
 
 #[test]
-fn a_node_that_departs_takes_its_parts_along() {
+fn the_diagnostics_of_a_removed_node_are_removed() {
     let mut robot = Robot::new();
-    robot.go_on(2, 8);
+    robot.publish_for(2, 8);
     assert_eq!(robot.findings().len(), 1);
     robot
         .domain
@@ -202,9 +202,9 @@ fn a_node_that_departs_takes_its_parts_along() {
 }
 
 #[test]
-fn what_an_aggregator_repeats_is_kept_and_is_no_finding_of_its_own() {
+fn repeated_statuses_of_an_aggregator_are_kept_without_a_finding() {
     let mut robot = Robot::with(Settings::default(), "rt/diagnostics_agg");
-    robot.go_on(2, 20);
+    robot.publish_for(2, 20);
     assert_eq!(robot.only().level, Error);
     assert_eq!((robot.findings(), robot.changes()), (vec![], vec![]));
 }
@@ -243,7 +243,7 @@ fn malformed_messages_count_and_keep_what_precedes_the_error() {
 }
 
 #[test]
-fn more_parts_than_the_table_holds_displace_the_most_silent_one() {
+fn a_diagnostic_part_beyond_the_cap_displaces_the_part_with_the_longest_silence() {
     let mut robot = Robot::new();
     for number in 0..1100 {
         let name = format!("part {number}");

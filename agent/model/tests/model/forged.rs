@@ -193,7 +193,7 @@ fn one_heartbeat_far_ahead_causes_no_loss() {
 }
 
 #[test]
-fn one_gap_far_ahead_excuses_no_sample() {
+fn one_gap_far_ahead_marks_no_sample_irrelevant() {
     for period in [10, 1000] {
         for number in [600, 4000, 1 << 20, 1 << 31] {
             let run = Run::new(true, period);
@@ -404,7 +404,7 @@ fn a_heartbeat_of_a_later_datagram_confirms_a_jump() {
 }
 
 #[test]
-fn samples_that_a_gap_excused_stay_excused_after_a_confirmed_jump() {
+fn samples_of_a_gap_stay_irrelevant_after_a_confirmed_jump() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     for number in 1..=100 {

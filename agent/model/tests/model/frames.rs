@@ -112,7 +112,7 @@ fn one_message_of_a_writer_is_captured_for_its_frame() {
 }
 
 #[test]
-fn frames_are_not_judged_before_the_static_transforms_are_known() {
+fn frames_are_not_evaluated_before_the_static_transforms_are_known() {
     let mut robot = Robot::new();
     let payload = forge::endpoint(writer(9), "rt/tf_static", DDS_TYPE, true);
     let sedp = Message::from(PREFIX).data(SEDP_WRITERS, 9, &payload);

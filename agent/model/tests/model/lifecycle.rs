@@ -122,7 +122,7 @@ fn the_state_after_the_last_transition_is_known_and_each_transition_is_an_event(
 }
 
 #[test]
-fn an_agent_that_came_later_learns_the_state_from_a_reply_to_a_client() {
+fn a_late_agent_reads_the_lifecycle_state_from_a_reply_to_a_client() {
     for is_cyclone in [false, true] {
         let mut node = Node::new();
         let (message, payload) = match is_cyclone {

@@ -41,7 +41,7 @@ fn listening() -> (Host, CapturePoint) {
 }
 
 /// Returns the numbers of the dispatched samples in order, with milliseconds since the start.
-fn given(host: &mut Host) -> Vec<(u64, u64)> {
+fn dispatched(host: &mut Host) -> Vec<(u64, u64)> {
     let given = host.observer.drain().samples.into_iter();
     given
         .filter_map(|given| match given.outcome {
@@ -55,7 +55,10 @@ fn given(host: &mut Host) -> Vec<(u64, u64)> {
 }
 
 fn numbers(host: &mut Host) -> Vec<u64> {
-    given(host).into_iter().map(|(number, _)| number).collect()
+    dispatched(host)
+        .into_iter()
+        .map(|(number, _)| number)
+        .collect()
 }
 
 /// Returns reason, first and last number of missing samples.
@@ -75,7 +78,7 @@ fn a_stream_without_gaps_is_dispatched_without_delay() {
     for number in 1..=100 {
         host.wait(10);
         host.data(bob, number);
-        assert_eq!(given(&mut host), [(number, number * 10)]);
+        assert_eq!(dispatched(&mut host), [(number, number * 10)]);
     }
 }
 
@@ -86,12 +89,12 @@ fn samples_after_a_gap_are_dispatched_at_the_time_of_its_repair() {
         host.wait(10);
         host.data(bob, number);
     }
-    assert_eq!(given(&mut host), [(1, 10), (2, 20)]);
+    assert_eq!(dispatched(&mut host), [(1, 10), (2, 20)]);
     host.request(bob, 3, 1, 1 << 31);
     host.wait(200);
-    assert!(given(&mut host).is_empty());
+    assert!(dispatched(&mut host).is_empty());
     host.data(bob, 3);
-    assert_eq!(given(&mut host), [(3, 240), (4, 240), (5, 240)]);
+    assert_eq!(dispatched(&mut host), [(3, 240), (4, 240), (5, 240)]);
     assert_eq!(host.measurement().recovered, 1);
 }
 
@@ -102,16 +105,16 @@ fn a_wait_ends_with_a_gap_a_heartbeat_or_an_acknack() {
     host.data(bob, 3);
     host.wait(10);
     host.gap(bob, 2);
-    assert_eq!(given(&mut host), [(1, 0), (3, 10)]);
+    assert_eq!(dispatched(&mut host), [(1, 0), (3, 10)]);
     host.data(bob, 5);
     host.wait(10);
     host.heartbeat(bob.directed(BOB), 5, 5);
-    assert_eq!(given(&mut host), [(5, 20)]);
+    assert_eq!(dispatched(&mut host), [(5, 20)]);
     host.acknack(bob, 6);
     host.data(bob, 7);
     host.wait(10);
     host.acknack(bob, 8);
-    assert_eq!(given(&mut host), [(7, 30)]);
+    assert_eq!(dispatched(&mut host), [(7, 30)]);
     host.wait(12_000);
     // Sample 6 used an unobserved transport; only the withdrawn one is lost.
     assert_eq!(missed(&mut host), [(MissedReason::Lost, 4, 4)]);
@@ -132,7 +135,7 @@ fn an_unexplained_gap_delays_dispatch_for_a_limited_time() {
     assert_eq!(numbers(&mut host), [5]);
     host.data(bob, 7);
     host.data(bob, 2);
-    assert_eq!(given(&mut host), [(2, 4_100)]);
+    assert_eq!(dispatched(&mut host), [(2, 4_100)]);
     host.data(bob, 6);
     assert_eq!(numbers(&mut host), [6, 7]);
 }
@@ -464,33 +467,33 @@ impl Handover {
 #[test]
 fn samples_keep_their_order_and_times_while_breakpoints_attach() {
     let mut handover = Handover::new(Depth::Arrivals, 2);
-    given(&mut handover.host);
+    dispatched(&mut handover.host);
     // Sample 3 was sent before the breakpoint was attached, and is polled after sample 4.
     handover.seen_in_its_process(4);
     handover.host.wait(1);
     handover.seen_in_its_process(5);
-    assert_eq!(given(&mut handover.host), []);
+    assert_eq!(dispatched(&mut handover.host), []);
     handover.host.wait(1);
     handover.polled(3);
     handover.polled(4);
     // Of the two observations of sample 4, the first one counts. Times neither decrease nor jump to
     // a later one.
-    assert_eq!(given(&mut handover.host), [(3, 10), (4, 10), (5, 10)]);
+    assert_eq!(dispatched(&mut handover.host), [(3, 10), (4, 10), (5, 10)]);
     handover.host.wait(10);
     handover.seen_in_its_process(6);
-    assert_eq!(given(&mut handover.host), [(6, 20)]);
+    assert_eq!(dispatched(&mut handover.host), [(6, 20)]);
     assert_eq!(handover.host.measurement().messages, 6);
 }
 
 #[test]
 fn samples_missed_while_breakpoints_attach_are_reported_once() {
     let mut handover = Handover::new(Depth::Arrivals, 2);
-    given(&mut handover.host);
+    dispatched(&mut handover.host);
     for number in [5, 6, 7] {
         handover.seen_in_its_process(number);
         handover.host.wait(4);
     }
-    assert_eq!(given(&mut handover.host), []);
+    assert_eq!(dispatched(&mut handover.host), []);
     handover.host.wait(500);
     let (mut numbers, mut times, mut reported) = (Vec::new(), Vec::new(), Vec::new());
     for dispatch in handover.host.observer.drain().samples {

@@ -209,7 +209,7 @@ impl Question {
         message.data_with(writer.entity, self.number, &[(0x800f, related)], &body(&[]))
     }
 
-    fn ask(&mut self, scene: &mut Scene, asked: &[&str]) -> u64 {
+    fn send_get_request(&mut self, scene: &mut Scene, asked: &[&str]) -> u64 {
         self.number += 1;
         let message = self.message(ASKS, self.number, |call| names(asked, call));
         scene.domain.put(message);
@@ -228,8 +228,8 @@ fn values_in_a_reply_are_known_and_no_changes() {
     for is_cyclone in [false, true] {
         let mut scene = Scene::with(Settings::default(), is_cyclone);
         let mut question = Question::announce(&mut scene);
-        let first = question.ask(&mut scene, &["speed", "absent", "retries"]);
-        let second = question.ask(&mut scene, &["depth"]);
+        let first = question.send_get_request(&mut scene, &["speed", "absent", "retries"]);
+        let second = question.send_get_request(&mut scene, &["depth"]);
         question.reply(&mut scene, second, &[Some(9)]);
         question.reply(&mut scene, first, &[Some(7), None, Some(3), Some(8)]);
         // A second reply, and one to a request that the agent did not see.
@@ -246,15 +246,15 @@ fn values_in_a_reply_are_known_and_no_changes() {
 }
 
 #[test]
-fn more_requests_than_the_table_holds_displace_the_oldest_ones() {
+fn requests_beyond_the_cap_displace_the_oldest_requests() {
     let mut scene = Scene::new();
     let mut question = Question::announce(&mut scene);
-    let first = question.ask(&mut scene, &["first"]);
+    let first = question.send_get_request(&mut scene, &["first"]);
     let many: Vec<String> = (0..500).map(|number| format!("p{number}")).collect();
     let many: Vec<&str> = many.iter().map(String::as_str).collect();
-    question.ask(&mut scene, &many);
-    let last = question.ask(&mut scene, &many);
-    question.ask(&mut scene, &many);
+    question.send_get_request(&mut scene, &many);
+    let last = question.send_get_request(&mut scene, &many);
+    question.send_get_request(&mut scene, &many);
     question.reply(&mut scene, first, &[Some(1)]);
     question.reply(&mut scene, last, &[Some(1), Some(2)]);
     let known = [("p0", "1"), ("p1", "2")];
@@ -276,7 +276,7 @@ fn an_old_request_or_one_for_another_value_is_not_the_cause() {
 }
 
 #[test]
-fn the_parameters_of_a_departed_node_are_forgotten_and_its_changes_stay() {
+fn the_parameters_of_a_removed_node_are_forgotten_and_its_changes_are_kept() {
     let mut scene = Scene::new();
     scene.event(&[("speed", 5)], &[("speed", 6)], &[]);
     let gone = Message::from(PLANNER).dispose_by_hash(SEDP_WRITERS, 2, EVENTS);
@@ -298,7 +298,7 @@ fn parameters_are_not_read_if_they_are_switched_off() {
 }
 
 #[test]
-fn more_parameters_than_the_table_holds_displace_the_oldest_value() {
+fn a_parameter_beyond_the_cap_displaces_the_oldest_value() {
     let mut scene = Scene::new();
     for number in 0..4200 {
         scene.event(&[(&format!("p{number}"), number)], &[], &[]);
@@ -311,7 +311,7 @@ fn more_parameters_than_the_table_holds_displace_the_oldest_value() {
 }
 
 #[test]
-fn more_nodes_than_the_table_holds_are_not_counted_and_old_changes_go() {
+fn nodes_beyond_the_cap_are_not_counted_and_the_oldest_changes_are_dropped() {
     let mut scene = Scene::new();
     for number in 0..1200 {
         scene.number += 1;

@@ -113,7 +113,7 @@ fn a_logger_names_the_node_that_is_not_announced() {
 }
 
 #[test]
-fn malformed_messages_and_text_of_other_encodings_cause_no_harm() {
+fn malformed_messages_and_text_of_other_encodings_are_counted_or_replaced() {
     let mut node = Node::new();
     node.send(&log(20, "robot1.lidar", b"a\xe9b \x1b[31m"));
     assert_eq!(&*node.facts().latest[0].text, "a\u{fffd}b \x1b[31m");
@@ -159,7 +159,7 @@ fn ten_errors_in_a_minute_are_a_burst_until_a_minute_passes_without_one() {
 }
 
 #[test]
-fn a_fatal_error_is_a_burst_and_a_few_errors_or_warnings_are_none() {
+fn a_fatal_error_is_a_burst_and_a_few_errors_or_warnings_are_not() {
     let mut node = Node::new();
     for _ in 0..200 {
         node.log(30, "warning");
@@ -198,7 +198,7 @@ fn logs_are_not_read_if_they_are_switched_off() {
 }
 
 #[test]
-fn more_nodes_than_the_table_holds_displace_the_most_silent_one() {
+fn a_node_beyond_the_cap_displaces_the_node_with_the_longest_silence() {
     let mut node = Node::new();
     for number in 0..600 {
         let name = format!("n{number}");

@@ -67,7 +67,7 @@ impl World {
     }
 
     /// Sends a packet of this participant from its socket on this host.
-    fn leaves(&mut self, prefix: GuidPrefix, socket: u64) {
+    fn send_from(&mut self, prefix: GuidPrefix, socket: u64) {
         self.observer.input(Input::Socket(SocketFacts {
             cookie: socket,
             process_id: Some(4711),
@@ -169,10 +169,10 @@ fn a_participant_with_a_socket_on_this_host_is_admitted_to_a_full_table() {
     world.crowd(1000);
     world.spdp(ALICE);
     assert!(!world.knows(ALICE));
-    world.leaves(ALICE, 77);
+    world.send_from(ALICE, 77);
     assert!(world.knows(ALICE));
     // The packet of a participant may precede its announcement.
-    world.leaves(BOB, 78);
+    world.send_from(BOB, 78);
     world.spdp(BOB);
     assert!(world.knows(BOB));
     world.sedp(writer(BOB), "rt/chatter");
@@ -186,7 +186,7 @@ fn a_socket_of_this_host_is_evidence_for_at_most_eight_participants() {
     world.crowd(1000);
     for number in 0..500 {
         world.spdp(forged(5000 + number));
-        world.leaves(forged(5000 + number), 77);
+        world.send_from(forged(5000 + number), 77);
         world.wait(10);
     }
     let known = |world: &World| {
@@ -196,7 +196,7 @@ fn a_socket_of_this_host_is_evidence_for_at_most_eight_participants() {
     };
     assert_eq!(known(&world), 8);
     // After that, the socket is not evidence for any participant, but another socket is.
-    world.leaves(ALICE, 78);
+    world.send_from(ALICE, 78);
     world.spdp(ALICE);
     assert!(world.knows(ALICE));
 }
@@ -370,7 +370,7 @@ fn a_flood_of_watched_names_displaces_neither_local_nor_sending_participants() {
     for turn in 1..=4 {
         robot.into_iter().for_each(|prefix| world.spdp(prefix));
         world.sample(writer(CAROL), turn);
-        world.leaves(BOB, 77);
+        world.send_from(BOB, 77);
         world.wait(1000);
     }
     world.sedp(writer(ALICE), "rt/points");
@@ -385,7 +385,7 @@ fn a_flood_of_watched_names_displaces_neither_local_nor_sending_participants() {
         world.sample(writer(ALICE), u64::from(second) + 1);
         if second % 8 == 0 {
             robot.into_iter().for_each(|prefix| world.spdp(prefix));
-            world.leaves(BOB, 77);
+            world.send_from(BOB, 77);
         }
     }
     let known = robot.map(|prefix| world.knows(prefix));
@@ -399,7 +399,7 @@ fn a_flood_of_watched_names_displaces_neither_local_nor_sending_participants() {
     let erin = GuidPrefix(*b"\x01\x10erins-host");
     world.spdp(erin);
     world.sedp(writer(erin), "rt/points");
-    world.leaves(erin, 80);
+    world.send_from(erin, 80);
     world.wait(1500);
     world.spdp(erin);
     assert!(world.knows(erin));
@@ -423,7 +423,7 @@ fn silent_forgeries_are_displaced_by_new_participants() {
         },
     );
     world.spdp(BOB);
-    world.leaves(BOB, 77);
+    world.send_from(BOB, 77);
     world.wait(100_000);
     world.spdp(ALICE);
     assert!(world.knows(BOB));
@@ -466,7 +466,7 @@ fn nodes_of_a_participant_with_a_higher_priority_displace_forged_ones() {
 }
 
 #[test]
-fn a_flood_into_full_tables_takes_no_longer_than_one_into_empty_ones() {
+fn a_flood_into_full_tables_takes_as_long_as_into_empty_tables() {
     const FLOOD: u32 = 20_000;
     let run = |crowd: u32| {
         let mut world = World::new(&["/points"], &Limits::default());

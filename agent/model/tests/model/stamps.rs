@@ -184,7 +184,7 @@ fn a_departed_publisher_has_no_fault_and_the_part_can_be_switched_off() {
 }
 
 #[test]
-fn more_publishers_than_the_table_holds_are_not_judged() {
+fn stamps_of_publishers_beyond_the_cap_are_not_evaluated() {
     let mut domain = VirtualDomain::new(&["/imu"], Settings::default());
     domain.participant(PREFIX, 1_000_000);
     for number in 1..=518 {

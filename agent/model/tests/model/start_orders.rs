@@ -161,7 +161,7 @@ impl Scene {
 }
 
 #[test]
-fn discovery_in_every_order_gives_the_same_figures() {
+fn discovery_in_any_order_yields_the_same_figures() {
     for order in permutations(&STEPS) {
         let mut scene = Scene::new();
         for step in &order {

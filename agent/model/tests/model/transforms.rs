@@ -71,7 +71,7 @@ impl Robot {
     }
 
     /// Broadcasts odom -> base_link of this guid at 10 Hz.
-    fn go_on(&mut self, guid: Guid, seconds: u64) {
+    fn broadcast_for(&mut self, guid: Guid, seconds: u64) {
         for _ in 0..seconds * 10 {
             self.broadcast(guid, "odom", "base_link", 1.0);
             self.wait(100);
@@ -117,7 +117,7 @@ fn names<const N: usize>(names: [&str; N]) -> Vec<String> {
 #[test]
 fn an_edge_has_its_last_transform_its_rate_and_its_broadcaster() {
     let mut robot = Robot::new();
-    robot.go_on(FIRST, 12);
+    robot.broadcast_for(FIRST, 12);
     robot.broadcast(FIRST, "/odom", "/base_link", 7.0);
     let edge = robot.edge("base_link");
     assert_eq!(
@@ -132,7 +132,7 @@ fn an_edge_has_its_last_transform_its_rate_and_its_broadcaster() {
 }
 
 #[test]
-fn each_namespace_and_each_kind_of_topic_has_its_place() {
+fn static_and_moving_transforms_of_each_namespace_are_separate() {
     let mut robot = Robot::with(Settings::default(), ["rt/robot1/tf_static", "rt/tf"]);
     let trees = robot.trees();
     assert_eq!(
@@ -152,15 +152,15 @@ fn each_namespace_and_each_kind_of_topic_has_its_place() {
 }
 
 #[test]
-fn a_living_broadcaster_that_ceases_is_a_fault_and_one_that_departs_is_none() {
+fn a_silent_broadcaster_is_a_fault_and_a_removed_broadcaster_is_not() {
     let mut robot = Robot::new();
-    robot.go_on(FIRST, 5);
+    robot.broadcast_for(FIRST, 5);
     (0..5).for_each(|_| robot.wait(1000));
     assert_eq!(
         robot.faults(),
         [(Silent, "base_link".to_owned(), names(["/ekf"]))]
     );
-    robot.go_on(FIRST, 2);
+    robot.broadcast_for(FIRST, 2);
     assert_eq!(robot.faults(), []);
     (0..5).for_each(|_| robot.wait(1000));
     let gone = Message::from(FIRST.prefix).dispose_by_hash(SEDP_WRITERS, 2, FIRST);
@@ -180,10 +180,10 @@ fn an_edge_at_one_fortieth_hertz_is_not_silent_between_two_transforms() {
 }
 
 #[test]
-fn two_broadcasters_at_once_are_a_fault_and_a_successor_is_none() {
+fn two_simultaneous_broadcasters_are_a_fault_and_a_successor_is_not() {
     let mut robot = Robot::new();
-    robot.go_on(FIRST, 8);
-    robot.go_on(SECOND, 8);
+    robot.broadcast_for(FIRST, 8);
+    robot.broadcast_for(SECOND, 8);
     assert!(
         robot
             .faults()
@@ -215,7 +215,7 @@ fn two_static_broadcasters_of_one_frame_are_a_fault_once_a_lease_would_have_ende
 }
 
 #[test]
-fn trees_that_stay_apart_are_a_fault_unless_static_transforms_are_unread() {
+fn unconnected_trees_are_a_fault_unless_static_transforms_are_unread() {
     let mut robot = Robot::with(Settings::default(), ["rt/tf", "rt/tf_static"]);
     let both = |robot: &mut Robot| {
         robot.broadcast(FIRST, "map", "odom", 1.0);
@@ -287,23 +287,23 @@ fn three_jumps_within_a_minute_are_a_fault_until_a_minute_after_the_first_one() 
 }
 
 #[test]
-fn a_stamp_that_goes_back_is_an_event_and_a_fault_for_a_minute() {
+fn a_backward_stamp_is_an_event_and_a_fault_for_a_minute() {
     let mut robot = Robot::new();
     robot.now = 100_000;
-    robot.go_on(FIRST, 3);
+    robot.broadcast_for(FIRST, 3);
     robot.now -= 50_000;
-    robot.go_on(FIRST, 2);
+    robot.broadcast_for(FIRST, 2);
     assert_eq!(robot.jumps(), [TransformJump::Time]);
     assert_eq!(
         robot.faults(),
         [(TimeWentBack, "base_link".to_owned(), names(["/ekf"]))]
     );
-    robot.go_on(FIRST, 60);
+    robot.broadcast_for(FIRST, 60);
     assert_eq!(robot.faults(), []);
 }
 
 #[test]
-fn numbers_that_are_none_do_no_harm() {
+fn nan_infinite_and_huge_coordinates_cause_no_fault() {
     let mut robot = Robot::new();
     for x in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, f64::MAX, 0.0] {
         (0..20).for_each(|_| robot.broadcast(FIRST, "odom", "base_link", x));
@@ -318,7 +318,7 @@ fn transforms_are_not_read_if_they_are_switched_off() {
         ..Settings::default()
     };
     let mut robot = Robot::with(settings, ["rt/tf"; 2]);
-    robot.go_on(FIRST, 1);
+    robot.broadcast_for(FIRST, 1);
     let facts = robot.domain.snapshot().transforms;
     assert!(!facts.are_read && facts.trees.is_empty());
 }
@@ -348,7 +348,7 @@ fn thirty_joints_at_100_hz_are_within_the_allowance() {
 }
 
 #[test]
-fn more_frames_and_namespaces_than_the_tables_hold_are_left_out() {
+fn frames_and_namespaces_beyond_the_caps_are_left_out() {
     let mut robot = Robot::new();
     for number in 0..2200 {
         robot.broadcast(FIRST, "map", &format!("frame{number}"), 1.0);
@@ -378,7 +378,7 @@ fn more_frames_and_namespaces_than_the_tables_hold_are_left_out() {
 }
 
 #[test]
-fn more_static_broadcasters_than_the_table_holds_count_as_read() {
+fn static_broadcasters_beyond_the_cap_count_as_read() {
     let mut domain = VirtualDomain::new(&[], Settings::default());
     domain.participant(FIRST.prefix, 100_000);
     for number in 0..1100_u16 {

@@ -286,7 +286,7 @@ fn a_connection_whose_ends_were_both_silent_ends_once() {
 }
 
 #[test]
-fn a_restarted_agent_knows_the_senders_and_detects_the_end() {
+fn a_restarted_agent_restores_the_senders_and_detects_the_end() {
     let (mut before, gid) = talking();
     subscribe(&mut before, 1001, LISTENER);
     let token = publisher(LISTENER, 10, "/status");
@@ -446,7 +446,7 @@ fn unseen(facts: &ZenohFacts, reason: Unseen) -> u64 {
 }
 
 /// Asserts that every table stays within its cap.
-fn bounded(observer: &Observer) {
+fn assert_bounded(observer: &Observer) {
     let tables = observer.snapshot(Timestamp(START)).tables;
     assert!(tables.iter().all(|table| table.size <= table.limit));
     let ledger = ledger();
@@ -474,7 +474,7 @@ fn new_connections_replace_those_with_the_longest_silence() {
             &init(TALKER, Role::Peer, None),
         );
     }
-    bounded(&observer);
+    assert_bounded(&observer);
     let directions = table(&observer, "zenoh_directions");
     assert!(directions.evictions >= 1900, "{directions:?}");
 }
@@ -511,7 +511,7 @@ fn aliases_tokens_and_keys_beyond_their_caps_are_left_out() {
             &frame(1, &[declare_token(entity + 1, &token)]),
         );
     }
-    bounded(&observer);
+    assert_bounded(&observer);
     let aliases = table(&observer, "zenoh_aliases");
     assert!(aliases.evictions > 7000, "{aliases:?}");
     let tokens = table(&observer, "zenoh_tokens");
@@ -531,19 +531,19 @@ fn a_token_declared_on_many_connections_is_one_session() {
             &frame(1, &[declare_token(1, &token)]),
         );
     }
-    bounded(&observer);
+    assert_bounded(&observer);
     assert_eq!(participants(&observer, START), 1);
 }
 
 /// Returns the bytes that the model holds after `attack` on each of 4096 connections. `attack` gets
 /// the model and the number of the connection.
-fn held_after(attack: impl Fn(&mut Observer, u16)) -> usize {
+fn bytes_after(attack: impl Fn(&mut Observer, u16)) -> usize {
     let before = allocator::held();
     let mut observer = observer();
     for port in 0..4096 {
         attack(&mut observer, port);
     }
-    bounded(&observer);
+    assert_bounded(&observer);
     observer.input(Input::Time(Timestamp(START + SECOND)));
     let held = allocator::held() - before;
     let mut tables = observer.snapshot(Timestamp(START)).tables.into_iter();
@@ -553,7 +553,7 @@ fn held_after(attack: impl Fn(&mut Observer, u16)) -> usize {
 
 #[test]
 fn long_aliases_on_all_connections_take_a_few_megabytes() {
-    let held = held_after(|observer, port| {
+    let held = bytes_after(|observer, port| {
         let [there, _] = connection(port);
         for id in 1..100 {
             let key = format!("0/{id}{}/t/TypeHashNotSupported", "a".repeat(2000));
@@ -566,7 +566,7 @@ fn long_aliases_on_all_connections_take_a_few_megabytes() {
 
 #[test]
 fn long_tokens_of_forged_sessions_on_all_connections_take_a_few_megabytes() {
-    let held = held_after(|observer, port| {
+    let held = bytes_after(|observer, port| {
         let [there, _] = connection(port);
         for id in 1..10 {
             let mut session = TALKER;
@@ -612,7 +612,7 @@ fn stale_fragments_are_dropped_for_a_large_message() {
             );
         }
     }
-    bounded(&observer);
+    assert_bounded(&observer);
     let incomplete = |observer: &Observer| {
         let facts = observer.snapshot(Timestamp(START)).zenoh;
         facts.map_or(0, |facts| facts.counters.incomplete)
@@ -645,7 +645,7 @@ fn the_number_of_routers_that_forward_tokens_is_bounded() {
         for stream in connection(number) {
             report(&mut observer, &stream, START, StreamEvent::End);
         }
-        bounded(&observer);
+        assert_bounded(&observer);
     }
     assert_eq!(table(&observer, "zenoh_passages").size, 256);
 }
@@ -678,7 +678,7 @@ fn messages_with_endless_fragments_are_bounded() {
             );
         }
     }
-    bounded(&observer);
+    assert_bounded(&observer);
 }
 
 #[test]
@@ -695,7 +695,7 @@ fn the_number_of_unseen_connections_is_bounded() {
             StreamEvent::Unseen(Unseen::Tls),
         );
     }
-    bounded(&observer);
+    assert_bounded(&observer);
     let facts = observer.snapshot(Timestamp(START)).zenoh.unwrap();
     assert_eq!(unseen(&facts, Unseen::Tls), 1024);
 }
@@ -716,6 +716,6 @@ proptest::proptest! {
             let message = frame(1, std::slice::from_ref(batch));
             send(&mut observer, &stream, START, &message);
         }
-        bounded(&observer);
+        assert_bounded(&observer);
     }
 }

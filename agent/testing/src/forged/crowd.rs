@@ -23,7 +23,7 @@ const LATE: f64 = 0.8;
 /// Time within which an observer notices the end of a lease.
 const GREY: Duration = Duration::from_millis(2500);
 /// Numbers of permanent participants, and of measured topics of each.
-const STAYING: usize = 20;
+const PERMANENT_MEMBERS: usize = 20;
 const MEASURED: usize = 10;
 const ENTITIES_WRITER: [u8; 4] = [0, 0, 1, 3];
 const ENTITIES_READER: [u8; 4] = [0, 0, 1, 4];
@@ -72,11 +72,11 @@ pub struct Crowd<C> {
     /// Number of messages on each measured topic.
     messages: Vec<u32>,
     /// Disposals of participants and endpoints since [`Crowd::forget`].
-    farewells: Vec<Vec<u8>>,
-    born: u32,
+    disposals: Vec<Vec<u8>>,
+    participants_created: u32,
     due: Instant,
     ticked: Instant,
-    owed: [f64; 3],
+    pending_messages: [f64; 3],
     next_topic: usize,
 }
 
@@ -91,19 +91,19 @@ impl<C: Carrier> Crowd<C> {
             members: Vec::new(),
             silent: Vec::new(),
             tally: Tally::new(),
-            messages: vec![0; STAYING * MEASURED],
-            farewells: Vec::new(),
-            born: 0,
+            messages: vec![0; PERMANENT_MEMBERS * MEASURED],
+            disposals: Vec::new(),
+            participants_created: 0,
             due: now,
             ticked: now,
-            owed: [0.0; 3],
+            pending_messages: [0.0; 3],
             next_topic: 0,
         }
     }
 
     /// Sets the target number of participants.
     pub fn aim(&mut self, participants: usize) {
-        self.target = participants.clamp(STAYING, self.scale.participants);
+        self.target = participants.clamp(PERMANENT_MEMBERS, self.scale.participants);
     }
 
     /// Changes the graph for this long.
@@ -116,7 +116,7 @@ impl<C: Carrier> Crowd<C> {
     }
 
     /// Keeps the graph unchanged for this long, and sends only renewals of leases.
-    pub fn rest(&mut self, span: Duration) -> Result<()> {
+    pub fn idle(&mut self, span: Duration) -> Result<()> {
         let end = Instant::now() + span;
         while Instant::now() < end {
             self.tick(false)?;
@@ -164,13 +164,13 @@ impl<C: Carrier> Crowd<C> {
     }
 
     /// Returns the number of participants ever created.
-    pub fn born(&self) -> u32 {
-        self.born
+    pub fn participants_created(&self) -> u32 {
+        self.participants_created
     }
 
     /// Repeats disposals and every valid announcement, for an observer that missed some.
     pub fn repeat(&mut self) -> Result<()> {
-        for farewell in self.farewells.clone() {
+        for farewell in self.disposals.clone() {
             self.send(&farewell)?;
         }
         for index in 0..self.members.len() {
@@ -185,32 +185,32 @@ impl<C: Carrier> Crowd<C> {
 
     /// Forgets past disposals, which the observer has seen.
     pub fn forget(&mut self) {
-        self.farewells.clear();
+        self.disposals.clear();
     }
 
     fn tick(&mut self, changes: bool) -> Result<()> {
         let now = Instant::now();
         let passed = now.duration_since(self.ticked).as_secs_f64().min(0.1);
         self.ticked = now;
-        self.bury();
+        self.drop_expired();
         self.renew()?;
         if changes {
-            let deaths = self.members.len().saturating_sub(STAYING) as f64;
+            let deaths = self.members.len().saturating_sub(PERMANENT_MEMBERS) as f64;
             let rates = [
                 deaths / self.scale.life.as_secs_f64(),
                 self.scale.endpoint_changes,
                 self.scale.messages,
             ];
-            for (owed, rate) in self.owed.iter_mut().zip(rates) {
+            for (owed, rate) in self.pending_messages.iter_mut().zip(rates) {
                 *owed += rate * passed;
             }
-            for _ in 0..self.owe(0) {
+            for _ in 0..self.schedule_messages(0) {
                 self.death()?;
             }
-            for _ in 0..self.owe(1) {
+            for _ in 0..self.schedule_messages(1) {
                 self.endpoint_change()?;
             }
-            for _ in 0..self.owe(2) {
+            for _ in 0..self.schedule_messages(2) {
                 self.message()?;
             }
             let surplus = self.members.len().saturating_sub(self.target);
@@ -226,14 +226,14 @@ impl<C: Carrier> Crowd<C> {
         Ok(())
     }
 
-    fn owe(&mut self, kind: usize) -> u64 {
-        let whole = self.owed[kind].floor();
-        self.owed[kind] -= whole;
+    fn schedule_messages(&mut self, kind: usize) -> u64 {
+        let whole = self.pending_messages[kind].floor();
+        self.pending_messages[kind] -= whole;
         whole as u64
     }
 
     /// Removes participants whose leases have ended.
-    fn bury(&mut self) {
+    fn drop_expired(&mut self) {
         let now = Instant::now();
         let (silenced, members) = std::mem::take(&mut self.members)
             .into_iter()
@@ -263,12 +263,12 @@ impl<C: Carrier> Crowd<C> {
     }
 
     fn birth(&mut self, node: String) -> Result<()> {
-        let staying = self.born < STAYING as u32;
+        let staying = self.participants_created < PERMANENT_MEMBERS as u32;
         let slot = self.free_slot();
         let lease = if staying { 100 } else { self.lease() };
         let mut prefix = *b"\x01\x0fcrowd.....";
-        prefix[8..].copy_from_slice(&self.born.to_be_bytes());
-        self.born += 1;
+        prefix[8..].copy_from_slice(&self.participants_created.to_be_bytes());
+        self.participants_created += 1;
         let mut member = Member {
             prefix,
             slot,
@@ -328,7 +328,7 @@ impl<C: Carrier> Crowd<C> {
         if let Some(member) = self.take() {
             let message = member.disposal(SPDP_WRITER, 2, PARTICIPANT, self.dice.pick(2) == 0);
             self.send(&message)?;
-            self.farewells.push(message);
+            self.disposals.push(message);
             self.count_end(&member, "disposed");
         }
         Ok(())
@@ -365,7 +365,7 @@ impl<C: Carrier> Crowd<C> {
                 let number = member.next_number(entity);
                 let message = member.disposal(announcer(entity), number, entity, by_key);
                 self.count(role(entity), "disposed", 1);
-                self.farewells.push(message.clone());
+                self.disposals.push(message.clone());
                 message
             }
             None => {
@@ -407,7 +407,7 @@ impl<C: Carrier> Crowd<C> {
 
     fn send(&mut self, message: &[u8]) -> Result<()> {
         self.due = (self.due + Duration::from_secs_f64(1.0 / PACE)).max(Instant::now());
-        self.carrier.carry(message)?;
+        self.carrier.send(message)?;
         let ahead = self.due.saturating_duration_since(Instant::now());
         if ahead > Duration::from_millis(2) {
             std::thread::sleep(ahead);

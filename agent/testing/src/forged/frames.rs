@@ -46,7 +46,7 @@ impl Wire {
 }
 
 impl Carrier for Wire {
-    fn carry(&mut self, payload: &[u8]) -> Result<()> {
+    fn send(&mut self, payload: &[u8]) -> Result<()> {
         let mut packets = fragments(payload, self.from, self.to, self.port);
         (self.shuffle)(&mut packets);
         for packet in packets {
@@ -81,7 +81,7 @@ impl Tun {
 }
 
 impl Carrier for Tun {
-    fn carry(&mut self, payload: &[u8]) -> Result<()> {
+    fn send(&mut self, payload: &[u8]) -> Result<()> {
         for packet in fragments(payload, self.from, self.to, DISCOVERY_PORT) {
             self.device
                 .write_all(&packet)

@@ -158,7 +158,7 @@ impl Talker {
 
 /// Carries UDP payloads to the observed host.
 pub trait Carrier {
-    fn carry(&mut self, payload: &[u8]) -> Result<()>;
+    fn send(&mut self, payload: &[u8]) -> Result<()>;
 }
 
 /// A UDP socket in a host's network, and its destination.
@@ -186,7 +186,7 @@ impl Sender {
 }
 
 impl Carrier for Sender {
-    fn carry(&mut self, payload: &[u8]) -> Result<()> {
+    fn send(&mut self, payload: &[u8]) -> Result<()> {
         self.socket
             .send_to(payload, self.to)
             .with_context(|| format!("cannot send to {}", self.to))?;
@@ -197,20 +197,20 @@ impl Carrier for Sender {
 /// Sends all announcements of the talker.
 pub fn introduce(talker: &Talker, carrier: &mut impl Carrier) -> Result<()> {
     for message in talker.introduction("talker") {
-        carrier.carry(&message)?;
+        carrier.send(&message)?;
     }
     std::thread::sleep(Duration::from_millis(300));
     Ok(())
 }
 
 /// Sends one sample of each size.
-pub fn talk(
+pub fn send_sizes(
     talker: &mut Talker,
     carrier: &mut impl Carrier,
     sizes: impl IntoIterator<Item = usize>,
 ) -> Result<()> {
     for size in sizes {
-        carrier.carry(&talker.sample(size))?;
+        carrier.send(&talker.sample(size))?;
         std::thread::sleep(Duration::from_millis(2));
     }
     Ok(())

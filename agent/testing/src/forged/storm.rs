@@ -9,7 +9,7 @@ use anyhow::{Result, anyhow};
 use super::{Carrier, SAMPLES_WRITER, Talker, data, introduce};
 
 /// Number of different datagrams of a storm. Each is sent with changing GUIDs.
-const MOULDS: usize = 3000;
+const TEMPLATES: usize = 3000;
 const PREFIX: std::ops::Range<usize> = 8..20;
 
 /// A thread that sends until [`Storm::end`].
@@ -23,11 +23,13 @@ impl Storm {
     /// Sends datagrams made by `forge`, each time with a new GUID prefix.
     pub fn start(carrier: impl Carrier + Send + 'static, forge: fn(&mut Dice) -> Vec<u8>) -> Storm {
         let mut dice = Dice(0x9e37_79b9_7f4a_7c15);
-        let moulds: Vec<Mould> = (0..MOULDS).map(|_| Mould::new(forge(&mut dice))).collect();
+        let moulds: Vec<PacketTemplate> = (0..TEMPLATES)
+            .map(|_| PacketTemplate::new(forge(&mut dice)))
+            .collect();
         let mut next = (0..moulds.len()).cycle();
         Storm::run(carrier, move |bytes| {
             let mould = next.next().unwrap_or(0);
-            moulds[mould].cast(&mut dice, bytes);
+            moulds[mould].instantiate(&mut dice, bytes);
         })
     }
 
@@ -102,7 +104,7 @@ impl Storm {
         for number in 0..WRITERS {
             let talker = Talker::new(1_000_000 + number, &format!("/large_{number}"));
             for message in talker.introduction("large") {
-                carrier.carry(&message)?;
+                carrier.send(&message)?;
             }
             talkers.push(talker);
         }
@@ -141,7 +143,7 @@ impl Storm {
             while !stopped.load(Ordering::Relaxed) {
                 next(&mut bytes);
                 // The storm continues if a queue on the path is full.
-                let _ = carrier.carry(&bytes);
+                let _ = carrier.send(&bytes);
                 counter.fetch_add(1, Ordering::Relaxed);
             }
         });
@@ -157,21 +159,21 @@ impl Storm {
 }
 
 /// A datagram and the offsets of its sender's GUID prefix.
-struct Mould {
+struct PacketTemplate {
     bytes: Vec<u8>,
     places: Vec<usize>,
 }
 
-impl Mould {
-    fn new(bytes: Vec<u8>) -> Mould {
+impl PacketTemplate {
+    fn new(bytes: Vec<u8>) -> PacketTemplate {
         let prefix = bytes[PREFIX].to_vec();
         let places = (0..=bytes.len() - PREFIX.len())
             .filter(|place| bytes[*place..].starts_with(&prefix))
             .collect();
-        Mould { bytes, places }
+        PacketTemplate { bytes, places }
     }
 
-    fn cast(&self, dice: &mut Dice, bytes: &mut Vec<u8>) {
+    fn instantiate(&self, dice: &mut Dice, bytes: &mut Vec<u8>) {
         bytes.clone_from(&self.bytes);
         let random = [dice.roll().to_ne_bytes(), dice.roll().to_ne_bytes()].concat();
         for place in &self.places {
@@ -222,7 +224,7 @@ impl Dice {
 
 /// Returns a datagram with invented content.
 pub fn forgery(dice: &mut Dice) -> Vec<u8> {
-    let talker = stranger(dice);
+    let talker = random_participant(dice);
     match dice.pick(10) {
         0 | 1 => participant_and_endpoints(dice, &talker),
         2 => talker.entities(&name(dice)),
@@ -347,7 +349,7 @@ fn submessage(bytes: &mut Vec<u8>, id: u8, body: &[u8]) {
 }
 
 /// Returns a participant with a random GUID.
-fn stranger(dice: &mut Dice) -> Talker {
+fn random_participant(dice: &mut Dice) -> Talker {
     let mut talker = Talker::new(0, "/forged");
     let random = [dice.roll().to_ne_bytes(), dice.roll().to_ne_bytes()].concat();
     talker.prefix.copy_from_slice(&random[..12]);

@@ -31,7 +31,7 @@ const START: Duration = Duration::from_secs(60);
 const ANSWER: Duration = Duration::from_secs(20);
 /// Time without a change of the counters: longer than the second after which a gap of a best-effort
 /// stream is settled.
-const STILL: Duration = Duration::from_millis(1800);
+const QUIET_TIME: Duration = Duration::from_millis(1800);
 /// The same time if the agent reports lost records or frames, so that some messages may never be
 /// counted.
 const STILL_WITHOUT_SOME: Duration = Duration::from_secs(6);
@@ -143,10 +143,10 @@ impl<'a> Agent<'a> {
             let all = page.sum("ros2_topic_messages_total", &label) >= messages as f64;
             let in_time = Instant::now() < deadline;
             let is_lossy = dropped(&page) > 0.0 && since.elapsed() >= STILL_WITHOUT_SOME;
-            if since.elapsed() >= STILL && (all || is_lossy || !in_time) {
+            if since.elapsed() >= QUIET_TIME && (all || is_lossy || !in_time) {
                 return Ok(page);
             }
-            if Instant::now() > deadline + STILL {
+            if Instant::now() > deadline + QUIET_TIME {
                 bail!(
                     "what is counted of {topic} does not stand still: {}",
                     page.0
@@ -185,7 +185,7 @@ impl Scrape {
     }
 
     /// Returns every counter above zero that could explain a difference.
-    pub fn doubts(&self) -> String {
+    pub fn doubted_jumps(&self) -> String {
         let telling = [
             "lost",
             "dropped",

@@ -37,16 +37,20 @@ pub enum Object {
 
 /// Whether a foreign program allows other programs to be attached.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Manners {
+pub enum AttachMode {
     /// Other programs can be attached.
-    BesideOthers,
+    Shared,
     /// Other programs cannot be attached.
-    Alone,
+    Exclusive,
 }
 
 /// Attaches to a cgroup a foreign program that accepts all packets. It stays attached until the
 /// cgroup is removed.
-pub fn attach_stranger(cgroup: &Path, direction: Direction, manners: Manners) -> Result<()> {
+pub fn attach_foreign_program(
+    cgroup: &Path,
+    direction: Direction,
+    manners: AttachMode,
+) -> Result<()> {
     // r0 = 1; exit
     let instructions: [u64; 2] = [0x0000_0001_0000_00b7, 0x95];
     let license = c"GPL";
@@ -65,8 +69,8 @@ pub fn attach_stranger(cgroup: &Path, direction: Direction, manners: Manners) ->
         program: program.as_raw_fd(),
         attach_type: direction as u32,
         flags: match manners {
-            Manners::BesideOthers => ALLOW_MULTI,
-            Manners::Alone => 0,
+            AttachMode::Shared => ALLOW_MULTI,
+            AttachMode::Exclusive => 0,
         },
     };
     bpf(PROG_ATTACH, &attach)?;

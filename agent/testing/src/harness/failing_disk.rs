@@ -25,7 +25,7 @@ pub struct Failing(u32);
 
 impl Failing {
     /// No operation.
-    pub const NOTHING: Self = Self(0);
+    pub const NO_OPERATION: Self = Self(0);
     /// Reads of files and directories.
     pub const READS: Self = Self(1);
     /// Writes.
@@ -99,7 +99,7 @@ impl FailingDisk {
 
 impl Drop for FailingDisk {
     fn drop(&mut self) {
-        self.fail(Failing::NOTHING);
+        self.fail(Failing::NO_OPERATION);
         let unmounted = Command::new("umount").arg("-l").arg(&self.place).status();
         if unmounted.is_ok_and(|status| status.success())
             && let Some(server) = self.server.take()

@@ -21,7 +21,7 @@ const MOST_OVERHEAD: usize = 180;
 const NO_BUILT_IN_WRITER: &str = "@th,440,8 != 0xc2 @th,568,8 != 0xc2";
 
 /// Mark of selected datagrams between the socket and the interface.
-const MARK: u32 = 0x7232;
+const PACKET_MARK: u32 = 0x7232;
 
 pub struct Loss<'a> {
     host: &'a Namespace,
@@ -127,14 +127,14 @@ impl<'a> Loss<'a> {
                 counter matched {{ }}
                 chain output {{
                     type filter hook output priority 0;
-                    {matches} counter name matched numgen inc mod {nth} == {last} meta mark set {MARK}
+                    {matches} counter name matched numgen inc mod {nth} == {last} meta mark set {PACKET_MARK}
                 }}
             }}
             table netdev loss {{
                 counter dropped {{ }}
                 chain egress {{
                     type filter hook egress device {INTERFACE} priority 0;
-                    meta mark {MARK} {kept_back} counter name dropped drop
+                    meta mark {PACKET_MARK} {kept_back} counter name dropped drop
                 }}
             }}"
         );

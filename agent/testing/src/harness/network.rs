@@ -72,7 +72,7 @@ impl Link {
 
 impl Namespace {
     /// Creates a host without a link: its nodes communicate over loopback only.
-    pub fn alone() -> Result<Namespace> {
+    pub fn isolated() -> Result<Namespace> {
         sweep()?;
         let host = Namespace::create("robot", next_subnet(), 1, None)?;
         // A browser treats an IPv6 address that is confirmed seconds later as a network change and

@@ -64,7 +64,8 @@ pub struct Stream {
     pub receive_buffer: u32,
     /// Fast DDS: whether it uses its default transports, which include shared memory.
     pub shares_memory: bool,
-    /// Fast DDS: the publisher's TCP address, at which it listens. Both peers use no other transport.
+    /// Fast DDS: the publisher's TCP address, at which it listens. Both peers use no other
+    /// transport.
     pub tcp: Option<SocketAddrV4>,
     /// Fast DDS: whether readers read the history of writers on their host.
     pub shares_history: bool,
@@ -293,7 +294,7 @@ impl Peer {
     }
 
     /// Lets a publisher send.
-    pub fn go(&mut self) -> Result<()> {
+    pub fn start_sending(&mut self) -> Result<()> {
         self.process.write_line("go")
     }
 

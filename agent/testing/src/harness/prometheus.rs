@@ -117,7 +117,7 @@ impl<'a> Prometheus<'a> {
     pub fn query(&self, expression: &str) -> Result<f64> {
         let deadline = Instant::now() + PATIENCE;
         loop {
-            let answer = self.ask(expression);
+            let answer = self.request(expression);
             let value = answer
                 .as_ref()
                 .ok()
@@ -156,7 +156,7 @@ impl<'a> Prometheus<'a> {
     /// Returns the labels of each current series of an expression.
     pub fn label_sets(&self, expression: &str) -> Result<Vec<BTreeMap<String, String>>> {
         let answer = self
-            .ask(expression)
+            .request(expression)
             .with_context(|| expression.to_owned())?;
         let result = answer.pointer("/data/result");
         let series = result.and_then(|result| result.as_array());
@@ -169,7 +169,7 @@ impl<'a> Prometheus<'a> {
 
     /// Returns the times of the first series' samples, for an expression such as `up[30s]`.
     pub fn times(&self, expression: &str) -> Result<Vec<f64>> {
-        let answer = self.ask(expression)?;
+        let answer = self.request(expression)?;
         let samples = answer.pointer("/data/result/0/values");
         let samples = samples.and_then(|samples| samples.as_array());
         let samples = samples.with_context(|| format!("{expression}: {answer}"))?;
@@ -179,7 +179,7 @@ impl<'a> Prometheus<'a> {
             .collect())
     }
 
-    fn ask(&self, expression: &str) -> Result<serde_json::Value> {
+    fn request(&self, expression: &str) -> Result<serde_json::Value> {
         let encoded: String = expression
             .bytes()
             .map(|byte| format!("%{byte:02X}"))

@@ -126,7 +126,7 @@ impl Shape {
     }
 
     /// Lets a publisher send its first samples, or the next `--stretch` of them.
-    pub fn go(&mut self) -> Result<()> {
+    pub fn start_sending(&mut self) -> Result<()> {
         self.process.write_line("go")
     }
 

@@ -18,7 +18,7 @@ impl Switched {
     /// Connects the two ends of a new link to a switch.
     pub fn new() -> Result<Switched> {
         let link = Link::new()?;
-        let switch = Namespace::alone()?;
+        let switch = Namespace::isolated()?;
         let name = switch.name();
         for host in [&link.robot, &switch] {
             run(&format!("ip -n {} link delete {INTERFACE}", host.name()))?;

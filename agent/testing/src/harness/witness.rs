@@ -29,11 +29,11 @@ const UNTIL_ALL_IS_SETTLED: u64 = 60_000_000_000;
 
 pub struct Witness {
     shared: Arc<Shared>,
-    thread: Option<JoinHandle<Result<Testimony>>>,
+    thread: Option<JoinHandle<Result<WitnessReport>>>,
 }
 
 /// State of the witness at the end.
-pub struct Testimony {
+pub struct WitnessReport {
     /// Snapshot after the peers left and all open samples were settled.
     pub end: Snapshot,
     pub losses: Vec<Loss>,
@@ -44,7 +44,7 @@ pub struct Testimony {
     pub skipped_runs: u64,
 }
 
-impl Testimony {
+impl WitnessReport {
     /// Fails if the kernel programs had to omit records.
     pub fn ensure_complete(&self) -> Result<()> {
         for (counter, value) in &self.counters {
@@ -133,7 +133,7 @@ impl Witness {
     }
 
     /// Reads the remaining records of the kernel, and settles all samples.
-    pub fn finish(&mut self) -> Result<Testimony> {
+    pub fn finish(&mut self) -> Result<WitnessReport> {
         self.shared.stop.store(true, Ordering::Relaxed);
         let thread = self.thread.take().context("the witness has ended")?;
         thread
@@ -152,7 +152,7 @@ impl Drop for Witness {
     }
 }
 
-fn watch(network: Option<&Path>, config: &Config, shared: &Shared) -> Result<Testimony> {
+fn watch(network: Option<&Path>, config: &Config, shared: &Shared) -> Result<WitnessReport> {
     let open = || LiveSource::open(&config.capture, Limits::default());
     let mut source = match network {
         Some(network) => netns::within(network, open)??,
@@ -179,7 +179,7 @@ fn watch(network: Option<&Path>, config: &Config, shared: &Shared) -> Result<Tes
     let end = Timestamp(source.clock().0.saturating_add(UNTIL_ALL_IS_SETTLED));
     observer.input(Input::Time(end));
     observer.input(Input::End);
-    Ok(Testimony {
+    Ok(WitnessReport {
         end: observer.snapshot(end),
         losses: observer.journal().losses().copied().collect(),
         delivery_losses: observer.journal().delivery_losses().copied().collect(),

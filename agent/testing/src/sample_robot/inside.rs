@@ -10,7 +10,7 @@ use ros2probe_model::facts::calls::facts::{
     TopicInside,
 };
 use ros2probe_model::facts::calls::late::{Activity, Cause, LateBound, LateCall, Stage};
-use ros2probe_model::facts::calls::other_thread::{Culprit, OtherThread, Priority};
+use ros2probe_model::facts::calls::other_thread::{OtherThread, Priority, ThreadLabel};
 use ros2probe_model::facts::calls::report::{Durations, ThreadStates, Trigger};
 use ros2probe_model::facts::diagnosis::{Diagnosis, TopicKey};
 use ros2probe_model::facts::model_time::ModelTime;
@@ -126,7 +126,7 @@ pub fn topic() -> TopicInside {
 pub fn source() -> InsideSourceFacts {
     InsideSourceFacts {
         mode: "full",
-        is_resting: false,
+        is_idle: false,
         shows_rates: true,
         libraries: vec![
             InsideLibrary {
@@ -148,8 +148,8 @@ pub fn source() -> InsideSourceFacts {
     }
 }
 
-fn chromium() -> Culprit {
-    Culprit {
+fn chromium() -> ThreadLabel {
+    ThreadLabel {
         name: "chromium".into(),
         unit: Some("kiosk.service".into()),
     }
@@ -216,7 +216,7 @@ fn late(topic: TopicName) -> LateCallback {
         stage: Stage::Callback,
         cause: Cause::Runnable,
         total: call.total(),
-        culprit: Some(chromium()),
+        other_thread: Some(chromium()),
     };
     LateCallback {
         owner: owner(0x40),

@@ -13,7 +13,7 @@ use ros2probe_wire::time::MILLISECOND;
 use ros2probe_wire::time::SECOND;
 use tempfile::TempDir;
 
-use super::super::cpu_allowance::{SAVINGS, SHARE};
+use super::super::cpu_allowance::{MAX_SAVINGS, SHARE_DIVISOR};
 use super::super::directories::Scope;
 use super::super::image::{PortImage, SegmentImage};
 use super::*;
@@ -42,7 +42,7 @@ struct Host {
     directory: TempDir,
     tap: Tap,
     now: u64,
-    calendar: Rc<Cell<u64>>,
+    wall_clock: Rc<Cell<u64>>,
 }
 
 impl Host {
@@ -50,15 +50,15 @@ impl Host {
         let directory = tempfile::tempdir().unwrap();
         let directories = vec![directory.path().to_path_buf()];
         let directories = ShmDirectories::new(Scope::Directories(directories));
-        let calendar = Rc::new(Cell::new(SECOND));
-        let clock = Rc::clone(&calendar);
+        let wall_clock = Rc::new(Cell::new(SECOND));
+        let clock = Rc::clone(&wall_clock);
         let mut tap = Tap::new(directories, move || clock.get());
         tap.classifier.set(writer(), Some(Verdict::Meter));
         Self {
             directory,
             tap,
             now: SECOND,
-            calendar,
+            wall_clock,
         }
     }
 
@@ -81,7 +81,7 @@ impl Host {
     /// Advances the clock and polls.
     fn find_after(&mut self, nanoseconds: u64) -> Vec<Item> {
         self.now += nanoseconds;
-        self.calendar.set(self.calendar.get() + nanoseconds);
+        self.wall_clock.set(self.wall_clock.get() + nanoseconds);
         let mut found = Vec::new();
         self.tap.poll(self.now, &mut found);
         found
@@ -134,7 +134,7 @@ fn a_discovery_message_is_passed_on_whole_with_its_port() {
     let mut message = sample(1);
     message[44..48].copy_from_slice(&[0, 1, 0, 0xc2]);
     port.push(segment.put(&message));
-    host.calendar.set(4);
+    host.wall_clock.set(4);
     let found = host.find_after(1);
     let [Item::Message { time, port, bytes }] = found.as_slice() else {
         panic!("{found:?}");
@@ -175,10 +175,10 @@ fn the_time_of_a_message_is_read_after_its_announcement() {
     let (mut port, mut segment) = (host.port(7411), host.segment(1));
     host.poll_after(SECOND);
     // The message is sent while the poll is in progress.
-    let clock = Rc::clone(&host.calendar);
-    host.tap.calendar = Box::new(move || clock.replace(clock.get() + 1000));
+    let clock = Rc::clone(&host.wall_clock);
+    host.tap.wall_clock = Box::new(move || clock.replace(clock.get() + 1000));
     port.push(segment.put(&sample(1)));
-    let sent = host.calendar.get();
+    let sent = host.wall_clock.get();
     let mut found = Vec::new();
     host.tap.poll(host.now, &mut found);
     let [Item::Record(record)] = found.as_slice() else {
@@ -192,7 +192,7 @@ fn a_silent_port_is_polled_every_time_while_every_message_is_needed() {
     let mut host = Host::new();
     let (mut port, mut segment) = (host.port(7411), host.segment(1));
     host.poll_after(SECOND);
-    host.tap.misses_nothing = true;
+    host.tap.needs_every_message = true;
     host.poll_after(SILENT_AFTER + 1);
     host.poll_after(MILLISECOND);
     let descriptor = segment.put(&sample(5));
@@ -250,7 +250,7 @@ fn files_of_a_killed_process_yield_neither_a_port_nor_messages() {
     let lives = [port.path(host.path()), living.path(host.path())];
     let lives = lives.each_ref().map(|path| lock_of(path, true));
     port.push(living.put(&sample(2)));
-    assert_eq!(host.poll_after(FIND_EVERY), [2]);
+    assert_eq!(host.poll_after(FIND_INTERVAL), [2]);
     assert!(host.tap.has_ports() && host.tap.take_discovery_seen());
     port.push(living.put(&sample(3)));
     assert_eq!(host.poll_after(MILLISECOND), [3]);
@@ -364,7 +364,7 @@ fn an_idle_port_is_polled_rarely_until_it_has_a_message() {
     let due = due.filter(|open| open.due <= host.now + MILLISECOND);
     assert_eq!(due.count(), 0);
     ports[77].push(segment.put(&sample(5)));
-    assert_eq!(host.poll_after(SILENT_EVERY), [5]);
+    assert_eq!(host.poll_after(SILENT_POLL_INTERVAL), [5]);
     // From now on that port is polled each time.
     ports[77].push(segment.put(&sample(6)));
     assert_eq!(host.poll_after(MILLISECOND), [6]);
@@ -377,7 +377,7 @@ fn a_flood_at_one_port_does_not_starve_the_others() {
     let mut flooded = PortImage::new(7400, 256, 0x100).in_directory(host.path());
     let (mut other, mut segment) = (host.port(7411), host.segment(1));
     host.poll_after(SECOND);
-    host.tap.is_hurried = true;
+    host.tap.is_urgent = true;
     let descriptor = segment.put(&sample(1));
     let mut found = Vec::new();
     for round in 0..4 {
@@ -393,7 +393,7 @@ fn a_flood_at_one_port_does_not_starve_the_others() {
 }
 
 #[test]
-fn constantly_expected_files_cost_no_more_than_the_share_for_listing() {
+fn constantly_expected_files_use_no_more_cpu_than_the_listing_share() {
     let mut host = Host::new();
     for number in 0..2000 {
         fs::write(host.path().join(format!("fastrtps_port{number}")), "").unwrap();
@@ -405,7 +405,7 @@ fn constantly_expected_files_cost_no_more_than_the_share_for_listing() {
         host.poll_after(10 * MILLISECOND);
     }
     let spent = thread_cpu() - before;
-    let most = SAVINGS + (host.now - began) / SHARE;
+    let most = MAX_SAVINGS + (host.now - began) / SHARE_DIVISOR;
     assert!(spent < 2 * most, "{spent} {most}");
     // A new port is opened all the same, if the share allows it.
     let (mut port, mut segment) = (host.port(7411), host.segment(1));
@@ -510,7 +510,7 @@ fn ports_of_dead_processes_beyond_the_cap_are_opened_again() {
     for group in numbers.chunks(400) {
         let ports: Vec<_> = group.iter().map(|number| host.port(*number)).collect();
         // A search would forget the ports of dead processes, so it is postponed.
-        host.tap.found = host.now + 1000 * SECOND;
+        host.tap.last_search = host.now + 1000 * SECOND;
         host.poll_after(100 * SECOND);
         for port in ports {
             fs::remove_file(port.path(host.path())).unwrap();
@@ -545,7 +545,7 @@ fn an_urgent_poll_reads_some_ports_and_the_next_polls_read_the_others() {
     let mut segment = host.segment(1);
     let mut ports: Vec<_> = (0..24).map(|index| host.port(7411 + 2 * index)).collect();
     host.poll_after(SECOND);
-    host.tap.is_hurried = true;
+    host.tap.is_urgent = true;
     for round in 1..=5 {
         for (port, number) in ports.iter_mut().zip(100 * round..) {
             port.push(segment.put(&sample(number)));

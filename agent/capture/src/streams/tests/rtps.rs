@@ -81,7 +81,7 @@ impl Connection {
             syn: false,
             end: false,
             boundary: None,
-            before: Before::Unknown,
+            before: MissingBefore::Unknown,
             bytes,
             length,
         };
@@ -168,7 +168,7 @@ fn a_connection_that_is_older_than_the_capture_is_read_from_its_next_frame_on() 
 }
 
 #[test]
-fn missing_bytes_cost_the_messages_that_they_are_part_of() {
+fn missing_bytes_lose_the_messages_that_contain_them() {
     let mut connection = Connection::default();
     let messages = [b"1", b"2", b"3", b"4"].map(|body| message(ONE, body));
     connection.whole(true, &frame(&messages[0], PORT));
@@ -224,7 +224,7 @@ fn a_frame_longer_than_the_limit_is_passed_with_its_first_bytes() {
 }
 
 #[test]
-fn a_header_in_a_payload_begins_no_frame_of_a_known_direction() {
+fn a_header_within_a_payload_of_a_known_direction_is_ignored() {
     let mut connection = Connection::default();
     let inner = frame(&message(OTHER, b"inner"), PORT);
     let outer = message(ONE, &inner);
@@ -236,7 +236,7 @@ fn a_header_in_a_payload_begins_no_frame_of_a_known_direction() {
 
 /// Many directions begin a large frame at the same time.
 #[test]
-fn frames_beyond_the_byte_cap_lose_their_payload_and_no_direction_its_place() {
+fn frames_beyond_the_byte_cap_lose_their_payload_and_each_direction_stays_synchronized() {
     const HALF: usize = 3 << 20;
     let mut streams = Streams::default();
     let mut large = frame(&message(ONE, &[]), PORT);
@@ -265,7 +265,7 @@ fn frames_beyond_the_byte_cap_lose_their_payload_and_no_direction_its_place() {
                 syn: false,
                 end: false,
                 boundary: None,
-                before: Before::Unknown,
+                before: MissingBefore::Unknown,
                 bytes,
                 length: bytes.len() as u32,
             };

@@ -114,7 +114,7 @@ fn a_split_header_or_reordered_fragments_cause_a_handover() {
                 continue; // user space has all of it
             }
             // User space reads the handed-over rest from the captured fragments.
-            records.extend(kernel.take_rest());
+            records.extend(kernel.take_remainder());
             let numbers: BTreeSet<_> = records
                 .iter()
                 .map(|record| record.sequence_number)
@@ -145,7 +145,7 @@ fn discovery_after_user_data_in_a_later_fragment_is_captured() {
         "the fragment with the announcement, and no other"
     );
     assert!(records.is_empty(), "they wait for the rest");
-    let rest = kernel.take_rest();
+    let rest = kernel.take_remainder();
     let seen: BTreeSet<_> = rest
         .iter()
         .map(|record| (record.writer, record.sequence_number))

@@ -73,7 +73,7 @@ fn only_datagrams_dropped_at_a_full_socket_are_reported() {
             for _ in 0..150 {
                 let message = talker.sample(1_000 + 4 * round);
                 sent.extend(samples(&message));
-                sender.carry(&message).unwrap();
+                sender.send(&message).unwrap();
             }
             std::thread::sleep(SETTLED);
             got.extend(read_all(&receiver));
@@ -132,7 +132,7 @@ fn full_sockets_are_reported_without_btf_if_every_socket_is_seen() {
     filter.attach_tracepoints(true);
     let (mut talker, writer) = talker(9);
     filter.set_interest(writer, Some(Verdict::Meter)).unwrap();
-    let host = Namespace::alone().unwrap();
+    let host = Namespace::isolated().unwrap();
     let receiver = one_cgroup.socket(&host, "127.0.0.1:7411");
     set(&receiver, libc::SO_RCVBUF, 32 * 1024);
     let mut sender = forged::Sender::new(&host, "127.0.0.1:0", "127.0.0.1:7411").unwrap();
@@ -140,7 +140,7 @@ fn full_sockets_are_reported_without_btf_if_every_socket_is_seen() {
     for _ in 0..100 {
         let message = talker.sample(1_000);
         sent.extend(samples(&message));
-        sender.carry(&message).unwrap();
+        sender.send(&message).unwrap();
     }
     std::thread::sleep(SETTLED);
     let missing: FragmentNumbers = sent.difference(&read_all(&receiver)).copied().collect();
@@ -175,7 +175,7 @@ fn only_the_full_one_of_two_sockets_in_a_group_is_reported() {
     for _ in 0..200 {
         let message = talker.sample(2_000);
         sent.extend(samples(&message));
-        sender.carry(&message).unwrap();
+        sender.send(&message).unwrap();
         std::thread::sleep(Duration::from_micros(200));
         got.extend(read_all(&quick));
     }
@@ -219,7 +219,7 @@ fn lost_fragments_of_a_large_sample_are_reported() {
         for start in 1..=4 {
             let message = fragment(&talker, number, start, 60_000);
             sent.extend(samples(&message));
-            sender.carry(&message).unwrap();
+            sender.send(&message).unwrap();
         }
     }
     std::thread::sleep(SETTLED);
@@ -253,7 +253,7 @@ fn a_captured_datagram_dropped_at_a_full_socket_is_reported_by_its_token() {
     for _ in 0..150 {
         let message = talker.sample(2_000);
         sent.extend(samples(&message));
-        sender.carry(&message).unwrap();
+        sender.send(&message).unwrap();
     }
     std::thread::sleep(SETTLED);
     let missing: FragmentNumbers = sent.difference(&read_all(&receiver)).copied().collect();
@@ -302,7 +302,7 @@ fn send_at_once(
                             .iter()
                             .map(|(number, _)| (writer, *number)),
                     );
-                    sender.carry(&message).unwrap();
+                    sender.send(&message).unwrap();
                 }
                 sent
             }));
@@ -339,7 +339,7 @@ fn losses_from_several_cpus_are_not_mixed_with_those_of_other_sockets() {
         record_ring_bytes: 8 << 20,
         ..FilterSettings::default()
     });
-    let host = Namespace::alone().unwrap();
+    let host = Namespace::isolated().unwrap();
     let receiver = observed.socket(&host, "127.0.0.1:7411");
     let other = observed.socket(&host, "127.0.0.1:7500");
     for socket in [&receiver, &other] {

@@ -3,7 +3,7 @@
 use super::*;
 
 /// Sets a host's reassembly timeout to a second.
-fn hurry(host: &Namespace) {
+fn shorten_reassembly_timeout(host: &Namespace) {
     netns::within(&host.network(), || {
         for path in ["ipv4/ipfrag_time", "ipv6/ip6frag_time"] {
             std::fs::write(format!("/proc/sys/net/{path}"), "1").unwrap();
@@ -13,13 +13,13 @@ fn hurry(host: &Namespace) {
 }
 
 /// Wait that is longer than this timeout.
-const GIVEN_UP: Duration = Duration::from_millis(2500);
+const AFTER_REASSEMBLY_TIMEOUT: Duration = Duration::from_millis(2500);
 
 #[test]
 fn a_datagram_without_its_last_fragment_is_reported() {
     let mut observed = Observed::new();
     let link = Link::new().unwrap();
-    hurry(&link.monitor);
+    shorten_reassembly_timeout(&link.monitor);
     let (mut talker, writer) = talker(1);
     observed
         .filter
@@ -27,16 +27,16 @@ fn a_datagram_without_its_last_fragment_is_reported() {
         .unwrap();
     let mut wire = Wire::new(&link.robot, &link.monitor, INTERFACE).unwrap();
     let before = observed.counted(Counter::NotReassembled);
-    wire.carry(&talker.sample(30_000)).unwrap();
+    wire.send(&talker.sample(30_000)).unwrap();
     wire.shuffle = |packets| drop(packets.pop());
     for _ in 2..=4 {
-        wire.carry(&talker.sample(30_000)).unwrap();
+        wire.send(&talker.sample(30_000)).unwrap();
     }
     wire.shuffle = |packets| drop(packets.remove(3));
-    wire.carry(&talker.sample(5_000)).unwrap();
+    wire.send(&talker.sample(5_000)).unwrap();
     wire.shuffle = |_| {};
-    wire.carry(&talker.sample(30_000)).unwrap();
-    let found = observed.records(writer, GIVEN_UP);
+    wire.send(&talker.sample(30_000)).unwrap();
+    let found = observed.records(writer, AFTER_REASSEMBLY_TIMEOUT);
     let mut numbers: Vec<_> = found.iter().map(|record| record.sequence_number).collect();
     numbers.sort_unstable();
     assert_eq!(numbers, [2, 3, 4, 5]);
@@ -64,7 +64,7 @@ fn a_datagram_without_its_last_fragment_is_reported() {
 fn a_datagram_without_its_first_fragment_is_counted_but_not_identified() {
     let mut observed = Observed::new();
     let link = Link::new().unwrap();
-    hurry(&link.monitor);
+    shorten_reassembly_timeout(&link.monitor);
     let (mut talker, writer) = talker(2);
     observed
         .filter
@@ -74,9 +74,9 @@ fn a_datagram_without_its_first_fragment_is_counted_but_not_identified() {
     let before = observed.counted(Counter::NotReassembledUnnamed);
     wire.shuffle = |packets| drop(packets.remove(0));
     for _ in 0..5 {
-        wire.carry(&talker.sample(30_000)).unwrap();
+        wire.send(&talker.sample(30_000)).unwrap();
     }
-    assert_eq!(observed.records(writer, GIVEN_UP), []);
+    assert_eq!(observed.records(writer, AFTER_REASSEMBLY_TIMEOUT), []);
     // Parallel tests may lose datagrams at the same time, but not one per fragment.
     let unnamed = observed.counted(Counter::NotReassembledUnnamed) - before;
     assert!((5..20).contains(&unnamed), "{unnamed}");
@@ -84,10 +84,10 @@ fn a_datagram_without_its_first_fragment_is_counted_but_not_identified() {
 
 #[test]
 fn a_datagram_with_fragments_too_far_apart_is_reported_when_given_up() {
-    static HELD: Mutex<Vec<Vec<u8>>> = Mutex::new(Vec::new());
+    static HELD_DATAGRAMS: Mutex<Vec<Vec<u8>>> = Mutex::new(Vec::new());
     let mut observed = Observed::new();
     let link = Link::new().unwrap();
-    hurry(&link.monitor);
+    shorten_reassembly_timeout(&link.monitor);
     let limit = || std::fs::write("/proc/sys/net/ipv4/ipfrag_max_dist", "2").unwrap();
     netns::within(&link.monitor.network(), limit).unwrap();
     let (mut talker, writer) = talker(8);
@@ -96,17 +96,17 @@ fn a_datagram_with_fragments_too_far_apart_is_reported_when_given_up() {
         .set_interest(writer, Some(Verdict::Meter))
         .unwrap();
     let mut wire = Wire::new(&link.robot, &link.monitor, INTERFACE).unwrap();
-    wire.shuffle = |packets| *HELD.lock().unwrap() = packets.split_off(2);
-    wire.carry(&talker.sample(20_000)).unwrap();
+    wire.shuffle = |packets| *HELD_DATAGRAMS.lock().unwrap() = packets.split_off(2);
+    wire.send(&talker.sample(20_000)).unwrap();
     wire.shuffle = |packets| packets.truncate(1);
     for _ in 2..=6 {
-        wire.carry(&talker.sample(20_000)).unwrap();
+        wire.send(&talker.sample(20_000)).unwrap();
     }
-    wire.shuffle = |packets| *packets = HELD.lock().unwrap().drain(..).collect();
-    wire.carry(&talker.sample(20_000)).unwrap();
+    wire.shuffle = |packets| *packets = HELD_DATAGRAMS.lock().unwrap().drain(..).collect();
+    wire.send(&talker.sample(20_000)).unwrap();
     let at_once = observed.records(writer, SETTLED);
     assert_eq!(fragment_numbers(&at_once), FragmentNumbers::from([(1, 0)]));
-    let later = observed.records(writer, GIVEN_UP);
+    let later = observed.records(writer, AFTER_REASSEMBLY_TIMEOUT);
     assert_eq!(
         fragment_numbers(&later),
         (2..=6).map(|number| (number, 0)).collect()
@@ -133,7 +133,7 @@ fn fragments_dropped_for_lack_of_memory_are_reported_immediately() {
         let _receiver = observed.socket(&link.monitor, &to);
         let mut sender = forged::Sender::new(&link.robot, &from, &to).unwrap();
         // The receiver's link address must be resolved first.
-        sender.carry(&talker.sample(100)).unwrap();
+        sender.send(&talker.sample(100)).unwrap();
         std::thread::sleep(SETTLED);
         observed.records(writer, Duration::ZERO);
         // Half of the first datagram uses up the limit, and keeps it.
@@ -144,7 +144,7 @@ fn fragments_dropped_for_lack_of_memory_are_reported_immediately() {
         netns::within(&link.monitor.network(), || limit("40000")).unwrap();
         let some = talker.sent() + 1;
         for _ in 0..5 {
-            sender.carry(&talker.sample(60_000)).unwrap();
+            sender.send(&talker.sample(60_000)).unwrap();
             std::thread::sleep(Duration::from_millis(5));
         }
         let found = observed.records(writer, SETTLED);
@@ -169,7 +169,7 @@ fn fragments_dropped_for_lack_of_memory_are_reported_immediately() {
 fn an_incomplete_datagram_over_ipv6_or_multicast_is_reported() {
     let group = Ipv4Addr::new(239, 255, 0, 8);
     let (mut observed, link, mut talker, writer) = observed_link(3, Verdict::Meter);
-    hurry(&link.monitor);
+    shorten_reassembly_timeout(&link.monitor);
     let member = observed.socket(&link.monitor, &format!("{group}:7411"));
     member
         .join_multicast_v4(&group, &link.monitor.address())
@@ -193,17 +193,17 @@ fn an_incomplete_datagram_over_ipv6_or_multicast_is_reported() {
     for (from, to, last_fragment, family) in ways {
         let mut sender = forged::Sender::new(&link.robot, &from, &to).unwrap();
         // The receiver's link address must be resolved first.
-        sender.carry(&talker.sample(100)).unwrap();
+        sender.send(&talker.sample(100)).unwrap();
         std::thread::sleep(SETTLED);
         observed.records(writer, Duration::ZERO);
         let lossy = Loss::of(&link.robot, last_fragment, 1000).unwrap();
         let before = talker.sent();
         for _ in 0..3 {
-            sender.carry(&talker.sample(60_000)).unwrap();
+            sender.send(&talker.sample(60_000)).unwrap();
         }
         drop(lossy);
-        sender.carry(&talker.sample(60_000)).unwrap();
-        let mut found = observed.records(writer, GIVEN_UP);
+        sender.send(&talker.sample(60_000)).unwrap();
+        let mut found = observed.records(writer, AFTER_REASSEMBLY_TIMEOUT);
         found.retain(|record| record.flags & flag::NOT_REASSEMBLED != 0);
         let expected: FragmentNumbers = (before + 1..before + 4)
             .map(|number| (number.into(), 0))

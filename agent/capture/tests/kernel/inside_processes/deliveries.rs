@@ -30,7 +30,7 @@ pub(super) const LATE: Duration = Duration::from_millis(100);
 const IMPRECISION: Duration = Duration::from_millis(20);
 
 /// A subscriber on a host of its own, and sockets that send to it.
-struct Way {
+struct DeliveryBench {
     host: Namespace,
     filter: Filter,
     robot: Robot,
@@ -43,13 +43,13 @@ struct Way {
     sequence_number: u32,
 }
 
-impl Way {
-    fn new() -> Result<Way> {
+impl DeliveryBench {
+    fn new() -> Result<DeliveryBench> {
         Self::over(Ipv4Addr::LOCALHOST.into())
     }
 
-    fn over(address: IpAddr) -> Result<Way> {
-        let host = Namespace::alone()?;
+    fn over(address: IpAddr) -> Result<DeliveryBench> {
+        let host = Namespace::isolated()?;
         let mut filter = Filter::load_host(&FilterSettings {
             deliveries: true,
             ..FilterSettings::default()
@@ -74,7 +74,7 @@ impl Way {
         let port = port.split(' ').next().unwrap().parse()?;
         let open = || netns::within(&host.network(), || UdpSocket::bind((address, 0)));
         let (near, far) = (host.hold(open)???, open()??);
-        let mut way = Way {
+        let mut way = DeliveryBench {
             filter,
             robot,
             process,
@@ -138,7 +138,7 @@ pub(super) fn assert_late_for(call: &LateCall, stage: Stage, cause: Cause) {
 }
 
 /// Asserts that a message that no thread receives is late for that reason.
-fn assert_waits_in_socket(way: &mut Way) -> Result<()> {
+fn assert_waits_in_socket(way: &mut DeliveryBench) -> Result<()> {
     way.send(Duration::ZERO)?;
     sleep(LATE);
     let call = way.receive("network 1 0");
@@ -148,7 +148,7 @@ fn assert_waits_in_socket(way: &mut Way) -> Result<()> {
 
 #[test]
 fn a_message_that_its_publisher_sends_late_names_the_publisher() -> Result<()> {
-    let mut way = Way::new()?;
+    let mut way = DeliveryBench::new()?;
     way.send(LATE)?;
     let call = way.receive("network 1 0");
     assert_late_for(&call, Stage::Publish, Cause::Send);
@@ -161,7 +161,7 @@ fn a_message_that_its_publisher_sends_late_names_the_publisher() -> Result<()> {
 
 #[test]
 fn a_message_of_another_host_that_arrives_late_names_the_network() -> Result<()> {
-    let mut way = Way::new()?;
+    let mut way = DeliveryBench::new()?;
     let datagram = way.datagram(LATE);
     way.far.send_to(&datagram, way.subscriber)?;
     let call = way.receive("network 1 0");
@@ -170,15 +170,15 @@ fn a_message_of_another_host_that_arrives_late_names_the_network() -> Result<()>
 }
 
 #[test]
-fn a_message_that_nobody_receives_names_the_socket() -> Result<()> {
-    let mut way = Way::new()?;
+fn an_unreceived_message_names_the_socket() -> Result<()> {
+    let mut way = DeliveryBench::new()?;
     assert_waits_in_socket(&mut way)?;
     Ok(())
 }
 
 #[test]
 fn a_message_that_the_middleware_keeps_names_the_middleware() -> Result<()> {
-    let mut way = Way::new()?;
+    let mut way = DeliveryBench::new()?;
     way.send(Duration::ZERO)?;
     let call = way.receive(&format!("network 1 {}", LATE.as_micros()));
     assert_late_for(&call, Stage::Wait, Cause::Middleware);
@@ -186,8 +186,8 @@ fn a_message_that_the_middleware_keeps_names_the_middleware() -> Result<()> {
 }
 
 #[test]
-fn a_message_keeps_its_place_before_others_and_a_full_buffer() -> Result<()> {
-    let mut way = Way::new()?;
+fn queue_times_are_known_behind_other_messages_and_at_a_full_buffer() -> Result<()> {
+    let mut way = DeliveryBench::new()?;
     way.send(Duration::ZERO)?;
     way.send(Duration::ZERO)?;
     // The buffer has room for some of these only.
@@ -210,14 +210,14 @@ fn a_message_keeps_its_place_before_others_and_a_full_buffer() -> Result<()> {
 
 #[test]
 fn a_message_over_ipv6_has_a_delivery_too() -> Result<()> {
-    let mut way = Way::over(Ipv6Addr::LOCALHOST.into())?;
+    let mut way = DeliveryBench::over(Ipv6Addr::LOCALHOST.into())?;
     assert_waits_in_socket(&mut way)?;
     Ok(())
 }
 
 #[test]
 fn a_stopped_process_is_the_cause_of_a_wait_in_its_socket() -> Result<()> {
-    let mut way = Way::new()?;
+    let mut way = DeliveryBench::new()?;
     let process = way.process.child.id().to_string();
     let signal = |name: &str| -> Result<()> {
         let sent = Command::new("kill").args([name, &process]).status()?;
@@ -249,14 +249,14 @@ fn a_stopped_process_is_the_cause_of_a_wait_in_its_socket() -> Result<()> {
 
 #[test]
 fn a_quota_is_the_cause_of_the_waits_of_messages() -> Result<()> {
-    let mut way = Way::new()?;
+    let mut way = DeliveryBench::new()?;
     // The process waits for the messages while another thread of its group computes.
     const MESSAGES: usize = 60;
     way.process.begin(&format!("network {MESSAGES} 0"));
     sleep(Duration::from_millis(20));
-    let quota = Quota::a_twentieth_for(&way.process);
+    let quota = Quota::limit_to_five_percent(&way.process);
     let hog = Hog::on("0-1");
-    quota.use_up(&hog);
+    quota.exhaust(&hog);
     for _ in 0..MESSAGES {
         way.send(Duration::ZERO)?;
         sleep(Duration::from_millis(15));
@@ -281,7 +281,7 @@ fn a_quota_is_the_cause_of_the_waits_of_messages() -> Result<()> {
 
 #[test]
 fn a_message_has_a_delivery_after_more_messages_than_the_cap() -> Result<()> {
-    let mut way = Way::new()?;
+    let mut way = DeliveryBench::new()?;
     for _ in 0..2 * DELIVERY_CAPACITY / 50 {
         for _ in 0..50 {
             way.send(Duration::ZERO)?;
@@ -295,7 +295,7 @@ fn a_message_has_a_delivery_after_more_messages_than_the_cap() -> Result<()> {
 
 #[test]
 fn a_socket_keeps_its_numbers_while_more_sockets_than_the_cap_receive() -> Result<()> {
-    let mut way = Way::new()?;
+    let mut way = DeliveryBench::new()?;
     let address = way.subscriber.ip();
     for _ in 0..2 * QUEUE_CAPACITY / 64 {
         for _ in 0..64 {
@@ -312,8 +312,8 @@ fn a_socket_keeps_its_numbers_while_more_sockets_than_the_cap_receive() -> Resul
 }
 
 #[test]
-fn a_filled_buffer_before_the_first_question_is_no_wait() -> Result<()> {
-    let mut way = Way::new()?;
+fn a_buffer_filled_before_the_first_request_is_not_a_wait() -> Result<()> {
+    let mut way = DeliveryBench::new()?;
     let mut deliveries = way.robot.deliveries.take().unwrap();
     deliveries.leave();
     way.send(LATE)?;

@@ -149,7 +149,7 @@ fn a_message_that_the_middleware_passes_on_late_names_the_middleware() {
 }
 
 #[test]
-fn a_message_for_a_thread_without_a_cpu_names_who_ran_instead() {
+fn a_delayed_wakeup_names_the_thread_that_ran_instead() {
     let mut subscriber = Subscriber::new();
     let listener = subscriber.listener();
     for command in [
@@ -196,9 +196,9 @@ fn a_message_for_a_thread_without_a_cpu_names_who_ran_instead() {
 #[test]
 fn a_message_for_a_process_beyond_its_quota_is_throttled() {
     let mut subscriber = Subscriber::new();
-    let quota = Quota::a_twentieth_for(&subscriber.process);
+    let quota = Quota::limit_to_five_percent(&subscriber.process);
     let hog = Hog::on("0-1");
-    quota.use_up(&hog);
+    quota.exhaust(&hog);
     const MESSAGES: usize = 30;
     subscriber.process.begin(&format!("shared {MESSAGES} 0"));
     for _ in 0..MESSAGES {

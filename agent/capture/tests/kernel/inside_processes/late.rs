@@ -58,8 +58,8 @@ pub(super) fn late(robot: &mut Robot, process: &mut Process, command: &str) -> V
     robot.round().report.late
 }
 
-/// Asserts that each call is late for this cause, which took this share of its time or more. On a busy
-/// machine, a call may also wait for a CPU, even for longer. That time is left out.
+/// Asserts that each call is late for this cause, which took this share of its time or more. On a
+/// busy machine, a call may also wait for a CPU, even for longer. That time is left out.
 fn assert_cause(calls: &[LateCall], number: usize, cause: Cause, share: f64) {
     assert_eq!(calls.len(), number, "{calls:#?}");
     for call in calls {
@@ -170,9 +170,10 @@ fn a_call_beside_a_real_time_thread_names_that_thread() {
     let _hog = Hog::real_time("0");
     let calls = late(&mut robot, &mut process, "compute 10 60000");
     let is_named = |call: &LateCall| {
-        let culprit = call.culprit(Stage::Callback);
-        culprit.is_some_and(|culprit| {
-            &*culprit.name == "sh" && culprit.priority == Some(Priority::RealTime(50))
+        let delaying_thread = call.longest_other_thread(Stage::Callback);
+        delaying_thread.is_some_and(|delaying_thread| {
+            &*delaying_thread.name == "sh"
+                && delaying_thread.priority == Some(Priority::RealTime(50))
         })
     };
     let named = calls.iter().filter(|call| is_named(call)).count();
@@ -233,7 +234,7 @@ fn a_call_that_waits_for_its_pages_is_named_so() {
 }
 
 #[test]
-fn a_stopped_call_names_who_continued_it() {
+fn a_stopped_call_names_the_thread_that_continued_it() {
     let (mut robot, mut process) = started();
     let id = process.child.id().cast_signed();
     let stop = std::thread::spawn(move || {
@@ -265,7 +266,7 @@ fn a_stopped_call_names_who_continued_it() {
 #[test]
 fn a_call_beyond_the_quota_of_its_control_group_is_throttled() {
     let (mut robot, mut process) = started();
-    let _quota = Quota::a_twentieth_for(&process);
+    let _quota = Quota::limit_to_five_percent(&process);
     let calls = late(&mut robot, &mut process, "compute 5 200000");
     assert_cause(&calls, 5, Cause::Throttled, 0.4);
 }
@@ -375,7 +376,7 @@ fn measure_the_causes_of_a_hundred_calls_each() {
         if hog.is_some() {
             pin(&process);
         }
-        let _quota = is_beside("quota").then(|| Quota::a_twentieth_for(&process));
+        let _quota = is_beside("quota").then(|| Quota::limit_to_five_percent(&process));
         let (mut all, mut right, mut named) = (0, 0, 0);
         let mut truth = [Duration::ZERO; 2];
         let mut measured = [Duration::ZERO; 2];

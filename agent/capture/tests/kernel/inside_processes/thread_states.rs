@@ -53,7 +53,7 @@ pub(super) struct Quota(PathBuf);
 
 impl Quota {
     /// Lets the process run for a twentieth of each 100 ms.
-    pub(super) fn a_twentieth_for(process: &Process) -> Self {
+    pub(super) fn limit_to_five_percent(process: &Process) -> Self {
         let name = format!("r2p-quota-{}", process.child.id());
         let first = PathBuf::from("/sys/fs/cgroup/cpu");
         let (group, limits): (_, &[_]) = if first.join("cpu.cfs_quota_us").exists() {
@@ -79,7 +79,7 @@ impl Quota {
     }
 
     /// Adds a thread that computes, so that the quota is always used up.
-    pub(super) fn use_up(&self, hog: &Hog) {
+    pub(super) fn exhaust(&self, hog: &Hog) {
         std::fs::write(self.0.join("cgroup.procs"), hog.0.id().to_string()).unwrap();
     }
 
@@ -174,7 +174,7 @@ fn a_callback_beside_a_busy_thread_is_runnable_for_as_long_as_the_kernel_counts(
 #[test]
 fn a_callback_beyond_the_quota_of_its_control_group_is_throttled() {
     let (mut robot, mut process) = started();
-    let quota = Quota::a_twentieth_for(&process);
+    let quota = Quota::limit_to_five_percent(&process);
     let before = quota.throttled();
     let (states, schedstat) = run(&mut robot, &mut process, "compute 3 300000");
     let throttled = quota.throttled() - before;

@@ -299,7 +299,7 @@ fn acknack(prefix: GuidPrefix, reader: EntityId) -> Vec<u8> {
 }
 
 #[test]
-fn small_frames_of_strangers_are_charged_and_those_of_known_readers_are_not() -> Result<()> {
+fn small_frames_of_unknown_readers_are_charged_and_those_of_known_readers_are_not() -> Result<()> {
     const BUDGET: usize = 5_000;
     const FRAMES: u8 = 100;
     let mut observed = Observed::new()?;

@@ -11,7 +11,7 @@ pub struct Tapped {
 
 impl Tapped {
     pub fn new() -> Result<Self> {
-        let host = Namespace::alone()?;
+        let host = Namespace::isolated()?;
         let settings = WireTapSettings {
             selection: Selection::new(&[], &[])?,
             ring_bytes: 8 << 20,
@@ -121,7 +121,7 @@ fn a_connection_seen_at_the_sockets_is_not_reported_again_on_the_wire() -> Resul
         syn: true,
         end: false,
         boundary: Some(Protocol::Zenoh),
-        before: Before::Unknown,
+        before: MissingBefore::Unknown,
         bytes: &init,
         length: init.len() as u32,
     };

@@ -15,7 +15,7 @@ use anyhow::{Context as _, Result, bail};
 use ros2probe::client::{Agent, Target};
 use ros2probe_api::health::{Health, PageToken};
 use ros2probe_api::recordings::{FilterOptions, Recording, RecordingList, RecordingRequest};
-use ros2probe_daemon::private_agent::{RECORDINGS, SOCKET};
+use ros2probe_daemon::private_agent::{RECORDINGS_DIRECTORY, SOCKET_NAME};
 use ros2probe_daemon::privilege::user_id;
 use rustix::process::{Pid, Signal, geteuid, getpid, kill_process};
 use serde_json::json;
@@ -24,14 +24,14 @@ use tempfile::TempDir;
 use super::artefacts::Artefacts;
 
 /// User of an agent that root starts.
-const USER: &str = "ros2probe";
+const AGENT_USER: &str = "ros2probe";
 /// Name of the recording.
-const BAG: &str = "bag";
+const BAG_NAME: &str = "bag";
 /// Maximum wait for the kernel to verify the programs on a busy machine.
-const START: Duration = Duration::from_secs(60);
+const START_TIMEOUT: Duration = Duration::from_secs(60);
 /// Maximum wait for the end, which completes the bag.
-const END: Duration = Duration::from_secs(40);
-const POLL: Duration = Duration::from_millis(50);
+const END_TIMEOUT: Duration = Duration::from_secs(40);
+const POLL_INTERVAL: Duration = Duration::from_millis(50);
 /// Maximum number of bytes of the log that are searched for its last line.
 const LOG_BYTES: u64 = 64 << 10;
 
@@ -55,7 +55,7 @@ impl AgentProcess {
         let directory =
             directory.context("cannot create a temporary directory; TMPDIR names another place")?;
         if geteuid().is_root()
-            && let Some(user) = user_id(USER)
+            && let Some(user) = user_id(AGENT_USER)
         {
             // Without the right to change the owner, the agent stays root as well.
             let _ = chown(directory.path(), Some(user), None);
@@ -94,10 +94,10 @@ impl AgentProcess {
     /// Waits until the agent observes. Returns `None` if a signal ends this program before.
     pub(super) fn wait_ready(&mut self, signals: &Receiver<Signal>) -> Result<Option<Agent>> {
         let target = Target {
-            socket: Some(self.directory.path().join(SOCKET)),
+            socket: Some(self.directory.path().join(SOCKET_NAME)),
             ..Target::default()
         };
-        let deadline = Instant::now() + START;
+        let deadline = Instant::now() + START_TIMEOUT;
         loop {
             let agent = Agent::reach(&target)?;
             if agent
@@ -115,16 +115,16 @@ impl AgentProcess {
             }
             if Instant::now() > deadline {
                 let log = self.log.display();
-                bail!("the agent is not ready after {START:?}; its log is {log}");
+                bail!("the agent is not ready after {START_TIMEOUT:?}; its log is {log}");
             }
-            std::thread::sleep(POLL);
+            std::thread::sleep(POLL_INTERVAL);
         }
     }
 
     /// Records every topic of the domain.
     pub(super) fn record(&self, agent: &Agent, domain_id: u32) -> Result<()> {
         let request = RecordingRequest {
-            name: Some(BAG.to_owned()),
+            name: Some(BAG_NAME.to_owned()),
             topics: FilterOptions {
                 include_hidden_topics: true,
                 ..FilterOptions::everything()
@@ -154,7 +154,7 @@ impl AgentProcess {
         }
         let list = agent.get::<RecordingList>("/recordings");
         let recordings = list.map(|list| list.recordings).unwrap_or_default();
-        let Some(bag) = recordings.into_iter().find(|it| it.name == BAG) else {
+        let Some(bag) = recordings.into_iter().find(|it| it.name == BAG_NAME) else {
             return "of unknown content: the agent did not answer".to_owned();
         };
         let (messages, missing) = (bag.report.messages, bag.report.missing);
@@ -167,7 +167,10 @@ impl AgentProcess {
 
     /// Returns the directory of the bag, which exists after [`Self::end`] if there is one.
     pub(super) fn recording(&self) -> PathBuf {
-        self.directory.path().join(RECORDINGS).join(BAG)
+        self.directory
+            .path()
+            .join(RECORDINGS_DIRECTORY)
+            .join(BAG_NAME)
     }
 
     pub(super) fn has_ended(&mut self) -> bool {
@@ -194,13 +197,13 @@ impl AgentProcess {
             return Ok(());
         }
         let _ = kill_process(Pid::from_child(&self.child), Signal::TERM);
-        let deadline = Instant::now() + END;
+        let deadline = Instant::now() + END_TIMEOUT;
         while !self.has_ended() {
             if Instant::now() > deadline {
                 self.child.kill()?;
                 self.child.wait()?;
             }
-            std::thread::sleep(POLL);
+            std::thread::sleep(POLL_INTERVAL);
         }
         Ok(())
     }

@@ -9,10 +9,10 @@ use anyhow::{Context as _, Result};
 
 use super::super::UserError;
 
-const JUNIT: &str = "junit.xml";
-const REPORT: &str = "report.html";
-const LOG: &str = "agent.log";
-const BAG: &str = "bag";
+const JUNIT_FILE: &str = "junit.xml";
+const REPORT_FILE: &str = "report.html";
+const LOG_FILE: &str = "agent.log";
+const BAG_NAME: &str = "bag";
 
 /// The directory.
 pub(super) struct Artefacts {
@@ -37,7 +37,7 @@ impl Artefacts {
         let artefacts = Self {
             directory: directory.to_path_buf(),
         };
-        for name in [JUNIT, REPORT, LOG] {
+        for name in [JUNIT_FILE, REPORT_FILE, LOG_FILE] {
             fs::write(directory.join(name), "").with_context(unwritable)?;
             fs::remove_file(directory.join(name)).with_context(unwritable)?;
         }
@@ -47,12 +47,12 @@ impl Artefacts {
 
     /// Returns the path of the agent's log.
     pub(super) fn log(&self) -> PathBuf {
-        self.directory.join(LOG)
+        self.directory.join(LOG_FILE)
     }
 
     /// Copies the bag in `recording`, if there is one. Returns `content` with the place of the bag.
     pub(super) fn keep_bag(&self, recording: &Path, content: String) -> Result<String> {
-        let bag = self.directory.join(BAG);
+        let bag = self.directory.join(BAG_NAME);
         let copy = || -> io::Result<bool> {
             if !recording.is_dir() {
                 return Ok(false);
@@ -68,14 +68,14 @@ impl Artefacts {
         };
         let is_kept = copy().with_context(|| format!("cannot write {}", bag.display()))?;
         Ok(match is_kept {
-            true => format!("{BAG}/: {content}"),
+            true => format!("{BAG_NAME}/: {content}"),
             false => content,
         })
     }
 
     /// Writes the reports.
     pub(super) fn write(&self, junit: &[u8], report: &str) -> Result<()> {
-        for (name, content) in [(JUNIT, junit), (REPORT, report.as_bytes())] {
+        for (name, content) in [(JUNIT_FILE, junit), (REPORT_FILE, report.as_bytes())] {
             let path = self.directory.join(name);
             fs::write(&path, content)
                 .with_context(|| format!("cannot write {}", path.display()))?;
@@ -85,7 +85,7 @@ impl Artefacts {
 
     /// Removes the bag of an earlier run, and nothing else.
     fn remove_bag(&self) -> Result<()> {
-        let bag = self.directory.join(BAG);
+        let bag = self.directory.join(BAG_NAME);
         let remove = || -> io::Result<bool> {
             if !bag.exists() {
                 return Ok(true);

@@ -16,7 +16,7 @@ use tokio::signal::unix::{SignalKind, signal};
 use tokio::time::timeout;
 
 /// Time between SIGTERM and SIGKILL to a command whose `rp ci` was killed.
-const PATIENCE: Duration = Duration::from_secs(5);
+const KILL_DELAY: Duration = Duration::from_secs(5);
 
 /// The command cannot be started.
 #[derive(Debug, thiserror::Error)]
@@ -168,7 +168,7 @@ pub(super) fn run(parent: i32, command: &[OsString]) -> Result<ExitCode> {
                         }
                         anyhow::Ok(())
                     };
-                    let _ = timeout(PATIENCE, gone).await;
+                    let _ = timeout(KILL_DELAY, gone).await;
                     send(Signal::KILL);
                     return Ok(ExitCode::FAILURE);
                 }

@@ -72,7 +72,7 @@ impl Destination {
     }
 
     /// Returns the end of a sentence about the result.
-    pub(super) fn phrase(&self) -> String {
+    pub(super) fn result_text(&self) -> String {
         match self {
             Self::StandardOutput => String::new(),
             Self::File(path) => format!(", are in {}", path.display()),

@@ -6,7 +6,7 @@ use std::sync::mpsc::Sender;
 use ros2probe_daemon::recording::Command;
 use rustix::termios::{LocalModes, OptionalActions, Termios, tcgetattr, tcsetattr};
 
-const SPACE: u8 = b' ';
+const SPACE_KEY: u8 = b' ';
 
 /// Standard input without line mode and echo. Dropping it restores the settings.
 pub(super) struct Keys(Termios);
@@ -37,7 +37,7 @@ pub(super) fn read_keys(give: Sender<Command>) {
     let read = move || {
         for byte in io::stdin().lock().bytes() {
             match byte {
-                Ok(SPACE) => {
+                Ok(SPACE_KEY) => {
                     let _ = give.send(Command::Toggle);
                 }
                 Ok(_) => {}

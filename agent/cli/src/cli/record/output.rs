@@ -14,17 +14,17 @@ use ros2probe_daemon::escape::visible;
 use ros2probe_daemon::missed_announcements::{explanation, remedy_for, sentence};
 use ros2probe_daemon::recording::{Activity, Finished, GraphSnapshot, Recorder};
 
-use super::super::notes::{SILENT, Sampling, is_sampled};
+use super::super::notes::{SILENCE_TIMEOUT, Sampling, is_sampled};
 use super::graph_cache::{GraphCache, locked};
 use super::shortfalls::{shortfalls, unobserved_lines};
 
 /// Interval of requests for writers without a known topic, and of reports about them while they
 /// send.
-const LOOK: Duration = Duration::from_secs(2);
-const REPEAT: Duration = Duration::from_secs(10);
+const REQUEST_INTERVAL: Duration = Duration::from_secs(2);
+const REPORT_INTERVAL: Duration = Duration::from_secs(10);
 
 /// Exit code of a conversion whose bag lacks messages of the capture.
-const INCOMPLETE: u8 = 3;
+const EXIT_INCOMPLETE: u8 = 3;
 
 /// Prints the messages, and keeps what was printed.
 pub(super) struct RecordingOutput<'a> {
@@ -68,7 +68,7 @@ impl<'a> UnknownWriters<'a> {
     /// send.
     fn warning(&mut self, options: &FilterOptions, now: Instant) -> Option<String> {
         let is_due = |at: Option<Instant>, after| at.is_none_or(|at| now - at >= after);
-        if !is_due(self.looked, LOOK) {
+        if !is_due(self.looked, REQUEST_INTERVAL) {
             return None;
         }
         let graph_cache = locked(self.graph_cache.as_ref()?);
@@ -86,7 +86,7 @@ impl<'a> UnknownWriters<'a> {
             is_first || before.is_none_or(|before| *before < count(writer))
         };
         let sending: Vec<_> = writers.iter().filter(sends).cloned().collect();
-        if sending.is_empty() || !is_due(self.reported, REPEAT) {
+        if sending.is_empty() || !is_due(self.reported, REPORT_INTERVAL) {
             return None;
         }
         self.reported = Some(now);
@@ -158,7 +158,7 @@ impl<'a> RecordingOutput<'a> {
     /// Reports topics that are sampled from the start.
     pub(super) fn sampled(&mut self, recorder: &Recorder<'_>, graph: &GraphSnapshot) {
         let topics = graph.topics.iter();
-        let topics = topics.filter(|topic| is_sampled(topic) && recorder.takes(topic));
+        let topics = topics.filter(|topic| is_sampled(topic) && recorder.is_selected(topic));
         if matches!(self.sampling, Sampling::Sampled(_)) {
             self.print_sampled(topics.map(|topic| topic.name.clone()).collect());
         }
@@ -174,15 +174,15 @@ impl<'a> RecordingOutput<'a> {
     }
 
     /// Reports once, after some time, why topics are silent.
-    fn explain(&mut self, recorder: &Recorder<'_>) {
-        if self.begun.elapsed() < SILENT {
+    fn print_silence_reasons(&mut self, recorder: &Recorder<'_>) {
+        if self.begun.elapsed() < SILENCE_TIMEOUT {
             return;
         }
         let Some(graph_cache) = self.graph_cache.take() else {
             return;
         };
         let graph = locked(&graph_cache).latest_snapshot();
-        let mut lines = unobserved_lines(&recorder.unobserved(&graph));
+        let mut lines = unobserved_lines(&recorder.unobserved_topics(&graph));
         let is_known = |name: &&String| graph.topics.iter().any(|topic| topic.name == **name);
         let unknown = recorder
             .options()
@@ -199,7 +199,7 @@ impl<'a> RecordingOutput<'a> {
     }
 
     fn recording(&mut self, recorder: &Recorder<'_>) {
-        self.explain(recorder);
+        self.print_silence_reasons(recorder);
         if let Some(text) = self
             .unknown_writers
             .warning(recorder.options(), Instant::now())
@@ -265,7 +265,8 @@ impl<'a> RecordingOutput<'a> {
 }
 
 /// Reports the messages in the bag and the missing ones. Returns exit code 1 if the storage failed
-/// or nothing of a capture was readable, and [`INCOMPLETE`] if messages of a capture are missing.
+/// or nothing of a capture was readable, and [`EXIT_INCOMPLETE`] if messages of a capture are
+/// missing.
 pub(super) fn report(ended: &Finished, outcome: &Outcome, is_replay: bool) -> ExitCode {
     for line in shortfalls(&ended.report) {
         log("WARN", &line);
@@ -294,7 +295,7 @@ pub(super) fn report(ended: &Finished, outcome: &Outcome, is_replay: bool) -> Ex
     if ended.error.is_some() || is_unreadable {
         ExitCode::FAILURE
     } else if is_replay && !is_complete {
-        ExitCode::from(INCOMPLETE)
+        ExitCode::from(EXIT_INCOMPLETE)
     } else {
         ExitCode::SUCCESS
     }

@@ -11,7 +11,7 @@ use ros2probe::client::{ClientError, Samples};
 use ros2probe_daemon::subscriptions::{Item, NextItem};
 
 /// Memory of a waiting item besides its payload, in bytes.
-const OVERHEAD: usize = 256;
+const ITEM_OVERHEAD: usize = 256;
 /// Maximum time until the reader notices that the recording has ended.
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
 
@@ -129,7 +129,7 @@ fn size(item: &Item) -> usize {
         Item::Sample(sample) => sample.payload.as_ref(),
         Item::Missed(_) | Item::Clock(_) | Item::End(_) => None,
     };
-    OVERHEAD + payload.map_or(0, bytes::Bytes::len)
+    ITEM_OVERHEAD + payload.map_or(0, bytes::Bytes::len)
 }
 
 #[cfg(test)]
@@ -147,12 +147,12 @@ mod tests {
 
     #[test]
     fn a_full_queue_makes_the_reader_wait_until_an_item_is_taken() {
-        let ahead = ReadAhead::new(2 * OVERHEAD);
+        let ahead = ReadAhead::new(2 * ITEM_OVERHEAD);
         std::thread::scope(|scope| {
             let reader = scope.spawn(|| {
                 for number in 0..4 {
                     ahead.push(Item::Clock(Timestamp(number)));
-                    assert!(ahead.lock().bytes <= 2 * OVERHEAD);
+                    assert!(ahead.lock().bytes <= 2 * ITEM_OVERHEAD);
                 }
             });
             let mut next = 0;
@@ -180,7 +180,7 @@ mod tests {
 
     #[test]
     fn the_end_of_the_stream_is_returned_after_its_last_item() {
-        let ahead = ReadAhead::new(OVERHEAD);
+        let ahead = ReadAhead::new(ITEM_OVERHEAD);
         ahead.push(Item::Clock(Timestamp(7)));
         ahead.lock().end = Some(Ok(()));
         assert_eq!(taken(&ahead), Some(7));

@@ -8,9 +8,9 @@ use ros2probe_api::topics::UNSUBSCRIBED;
 use ros2probe_daemon::tables::RecordedTopics;
 
 /// Maximum number of topics named in one line.
-const NAMES: usize = 8;
+const MAX_NAMED_TOPICS: usize = 8;
 /// Reasons for a published topic without visible messages, with their texts.
-const UNOBSERVED: [(&str, &str); 5] = [
+const UNOBSERVED_REASONS: [(&str, &str); 5] = [
     (NO_SUBSCRIBER, UNSUBSCRIBED),
     (
         "shared_memory",
@@ -108,10 +108,10 @@ pub(super) fn shortfalls(report: &Report) -> Vec<String> {
 
 /// Returns text about invisible topics, one line per reason.
 pub(super) fn unobserved_lines(unobserved: &BTreeMap<String, String>) -> Vec<String> {
-    let lines = UNOBSERVED.iter().filter_map(|(why, what)| {
+    let lines = UNOBSERVED_REASONS.iter().filter_map(|(why, what)| {
         let topics = unobserved.iter().filter(|(_, reason)| reason == why);
         let names: Vec<&str> = topics.map(|(name, _)| name.as_str()).collect();
-        let line = format!("{}: no message recorded; {what}", few(&names));
+        let line = format!("{}: no message recorded; {what}", shortened_list(&names));
         (!names.is_empty()).then_some(line)
     });
     lines.collect()
@@ -124,14 +124,14 @@ fn counted(count: u64, thing: &str) -> String {
 }
 
 /// Returns the first names of a list, and the number of others.
-fn few(names: &[&str]) -> String {
+fn shortened_list(names: &[&str]) -> String {
     let shown = names
         .iter()
-        .take(NAMES)
+        .take(MAX_NAMED_TOPICS)
         .copied()
         .collect::<Vec<_>>()
         .join(", ");
-    match names.len().saturating_sub(NAMES) {
+    match names.len().saturating_sub(MAX_NAMED_TOPICS) {
         0 => shown,
         more => format!("{shown} and {more} more"),
     }
@@ -178,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn messages_of_topics_that_a_bag_lacks_are_named_and_make_it_incomplete() {
+    fn topics_missing_in_a_bag_are_named_and_make_it_incomplete() {
         let mut report = Report::default();
         let unobserved = |why: &str| ("/imu".to_owned(), why.to_owned());
         report.unobserved.extend([unobserved(NO_SUBSCRIBER)]);

@@ -8,7 +8,7 @@ use std::sync::mpsc::Sender;
 use ros2probe_daemon::recording::Command;
 use tokio::signal::unix::{SignalKind, signal};
 
-use super::super::interrupt::INTERRUPTED;
+use super::super::interrupt::EXIT_INTERRUPTED;
 use super::output::log;
 
 /// Phase of a recording, shared with the signal thread.
@@ -79,14 +79,14 @@ pub(super) fn listen(give: Sender<Command>, phase: Phase) -> io::Result<()> {
                         "INFO",
                         "Interrupted before the recording began; no bag was created",
                     );
-                    std::process::exit(INTERRUPTED.into());
+                    std::process::exit(EXIT_INTERRUPTED.into());
                 }
                 1 => Command::Stop,
-                2 => Command::Hurry,
+                2 => Command::Abort,
                 _ => {
                     let text = "Interrupted; `rp bag reindex` completes the bag";
                     log("ERROR", text);
-                    std::process::exit(INTERRUPTED.into());
+                    std::process::exit(EXIT_INTERRUPTED.into());
                 }
             };
             // A recording that has ended accepts no commands.

@@ -5,7 +5,7 @@ use std::io;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, ToSocketAddrs as _};
 
 /// Port of `rmw_zenohd`.
-pub const PORT: u16 = 7447;
+pub const ROUTER_PORT: u16 = 7447;
 const LOCALHOST: &str = "localhost";
 
 /// Host and port of a router.
@@ -16,7 +16,7 @@ pub struct RouterAddress {
 }
 
 impl RouterAddress {
-    /// Parses an address. A missing port is [`PORT`].
+    /// Parses an address. A missing port is [`ROUTER_PORT`].
     ///
     /// # Errors
     ///
@@ -45,7 +45,7 @@ impl RouterAddress {
             return Err(form);
         }
         let port = match port.strip_prefix(':').map(str::parse) {
-            None if port.is_empty() => PORT,
+            None if port.is_empty() => ROUTER_PORT,
             None => return Err(form),
             Some(Ok(port)) if port > 0 => port,
             Some(_) => return Err("the port must be a number from 1 to 65535"),
@@ -78,7 +78,7 @@ impl Default for RouterAddress {
     fn default() -> Self {
         Self {
             host: LOCALHOST.to_owned(),
-            port: PORT,
+            port: ROUTER_PORT,
         }
     }
 }

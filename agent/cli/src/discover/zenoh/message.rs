@@ -18,7 +18,7 @@ const LEASE_SECONDS: u8 = 60;
 /// bytes, the defaults.
 const INIT: u8 = 0x01 | 0x80;
 /// Length of the id, 16 bytes, and the role of a client.
-const CLIENT: u8 = 0xf2;
+const ID_LEN_AND_ROLE: u8 = 0xf2;
 /// Lanes with priorities, and patch level 1, as in each session of ROS. An agent that reads the
 /// answer then finds the declarations on the same lane.
 const INIT_EXTENSIONS: [u8; 3] = [0x81, 0x27, 1];
@@ -33,14 +33,14 @@ const CONTROL_FRAME: [u8; 4] = [0x05 | 0x20 | 0x80, SEQUENCE_NUMBER, 0x31, 0];
 /// INTEREST for current declarations, with an extension.
 const INTEREST_CURRENT: u8 = 0x19 | 0x20 | 0x80;
 /// Aliases and tokens, restricted to a key that is written in full.
-const OPTIONS: u8 = 0x01 | 0x08 | 0x10 | 0x20;
+const INTEREST_OPTIONS: u8 = 0x01 | 0x08 | 0x10 | 0x20;
 /// Priority CONTROL. The message blocks instead of being dropped.
 const INTEREST_EXTENSIONS: [u8; 2] = [0x21, 0x08];
 
 /// Returns the introduction of a client with this id.
 #[must_use]
 pub fn introduction(id: [u8; 16]) -> Vec<u8> {
-    batch(&[&[INIT, VERSION, CLIENT], &id, &INIT_EXTENSIONS])
+    batch(&[&[INIT, VERSION, ID_LEN_AND_ROLE], &id, &INIT_EXTENSIONS])
 }
 
 /// Returns the opening, which repeats the router's cookie.
@@ -59,7 +59,7 @@ pub fn request(key: &str, has_priorities: bool) -> Vec<u8> {
     } else {
         &FRAME
     };
-    let interest = [INTEREST_CURRENT, INTEREST, OPTIONS];
+    let interest = [INTEREST_CURRENT, INTEREST, INTEREST_OPTIONS];
     let (scope, length) = ([0], vle(key.len() as u64));
     let key = [&scope[..], &length, key.as_bytes()].concat();
     batch(&[frame, &interest, &key, &INTEREST_EXTENSIONS])

@@ -1,7 +1,8 @@
 //! `rp discover --router`: requests the liveliness tokens of all nodes from a Zenoh router.
 //!
 //! The command opens a client session over one TCP connection for a few milliseconds. The session
-//! declares nothing and subscribes to nothing, so no node appears and other sessions receive nothing.
+//! declares nothing and subscribes to nothing, so no node appears and other sessions receive
+//! nothing.
 
 pub mod address;
 pub mod error;
@@ -23,12 +24,12 @@ use self::session::{Session, Step};
 /// Maximum wait for the connection, for each answer, and between two parts of the last answer.
 const TIMEOUT: Duration = Duration::from_secs(3);
 /// Maximum wait for all tokens.
-const LIMIT: Duration = Duration::from_secs(30);
+const MAX_DURATION: Duration = Duration::from_secs(30);
 /// Wait for the router to close the connection after the goodbye. If this side closed it first,
 /// bytes of the router in flight would reset it.
-const LINGER: Duration = Duration::from_millis(200);
+const LINGER_TIME: Duration = Duration::from_millis(200);
 /// Maximum number of bytes per read.
-const READ: usize = 64 << 10;
+const READ_BYTES: usize = 64 << 10;
 
 /// Number of batches, and their bytes including the lengths before them.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -52,7 +53,7 @@ pub struct Answer {
     pub took: Duration,
 }
 
-/// A message that [`converse`] sends.
+/// A message that [`run_conversation`] sends.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Planned {
     /// Purpose, for people.
@@ -63,7 +64,7 @@ pub struct Planned {
     pub note: &'static str,
 }
 
-/// Returns what [`converse`] sends to a router that answers.
+/// Returns what [`run_conversation`] sends to a router that answers.
 #[must_use]
 pub fn plan(domain_id: Option<u32>) -> [Planned; 4] {
     let planned = |what, bytes: Vec<u8>, note| Planned {
@@ -118,7 +119,7 @@ pub fn connect(address: &RouterAddress) -> Result<(TcpStream, SocketAddr), Route
 /// # Errors
 ///
 /// Fails if the router breaks, ends or refuses the conversation, or is silent.
-pub fn converse(
+pub fn run_conversation(
     stream: TcpStream,
     peer: SocketAddr,
     domain_id: Option<u32>,
@@ -140,9 +141,9 @@ pub fn converse(
     let ended = conversation.listen(&mut session);
     // A peer that is not a router receives nothing more.
     if session.router().is_some() {
-        let said = conversation.send("goodbye (CLOSE)", &message::goodbye());
+        let sent = conversation.send("goodbye (CLOSE)", &message::goodbye());
         if ended.is_ok() {
-            said?;
+            sent?;
         }
     }
     ended?;
@@ -186,19 +187,19 @@ impl Conversation {
         sent.map_err(|source| self.broken(source))?;
         self.sent.add(bytes.len());
         self.after = what;
-        self.within(TIMEOUT);
+        self.set_timeout(TIMEOUT);
         Ok(())
     }
 
     /// Sets the maximum wait for the next answer.
-    fn within(&mut self, limit: Duration) {
+    fn set_timeout(&mut self, limit: Duration) {
         self.limit = limit;
         self.deadline = Instant::now() + limit;
     }
 
     /// Receives and answers until the session is over.
     fn listen(&mut self, session: &mut Session) -> Result<(), RouterError> {
-        let mut chunk = vec![0; READ];
+        let mut chunk = vec![0; READ_BYTES];
         let peer = self.peer;
         let unusable = |why| RouterError::Unusable { peer, why };
         while !session.is_over() {
@@ -214,7 +215,7 @@ impl Conversation {
                 for outgoing in session.receive(batch).map_err(unusable)? {
                     self.send(outgoing.what, &outgoing.bytes)?;
                     if session.step() == Step::Request {
-                        self.within(LIMIT);
+                        self.set_timeout(MAX_DURATION);
                     }
                 }
                 if session.is_over() {
@@ -259,7 +260,7 @@ impl Conversation {
     /// Waits for the router to end the connection.
     fn linger(&mut self) {
         let _ = self.stream.shutdown(Shutdown::Write);
-        let end = Instant::now() + LINGER;
+        let end = Instant::now() + LINGER_TIME;
         let mut chunk = [0; 1024];
         loop {
             let left = end.saturating_duration_since(Instant::now());

@@ -96,7 +96,7 @@ pub struct Session {
     chains: BTreeMap<Lane, Chain>,
     tokens: Tokens,
     /// Number of bytes left below the cap.
-    room: usize,
+    bytes_left: usize,
 }
 
 /// The FRAGMENTs of a message.
@@ -119,7 +119,7 @@ impl Session {
             aliases: BTreeMap::new(),
             chains: BTreeMap::new(),
             tokens: Tokens::default(),
-            room: MOST_BYTES,
+            bytes_left: MOST_BYTES,
         }
     }
 
@@ -150,7 +150,7 @@ impl Session {
     /// Fails if the batch cannot be used. The conversation is then over.
     pub fn receive(&mut self, batch: &[u8]) -> Result<Vec<Outgoing>, Unusable> {
         let mut outgoing = Vec::new();
-        if !self.spend(batch.len()) {
+        if !self.take_bytes(batch.len()) {
             return Ok(outgoing);
         }
         for message in Batch::whole(batch) {
@@ -311,13 +311,13 @@ impl Session {
         }
         let prefix = self.aliases.get(&expression.scope)?;
         let key = [prefix, expression.suffix].concat();
-        self.spend(key.len()).then_some(key)
+        self.take_bytes(key.len()).then_some(key)
     }
 
     /// Subtracts bytes from those left below the cap. Returns `false` if the cap is reached.
-    fn spend(&mut self, bytes: usize) -> bool {
-        match self.room.checked_sub(bytes) {
-            Some(room) => self.room = room,
+    fn take_bytes(&mut self, bytes: usize) -> bool {
+        match self.bytes_left.checked_sub(bytes) {
+            Some(room) => self.bytes_left = room,
             None => self.step = Step::Full,
         }
         self.step != Step::Full

@@ -96,7 +96,7 @@ fn a_cap_that_is_or_was_reached_leads_to_a_warning_with_the_line_to_change() {
 }
 
 #[test]
-fn an_agent_at_a_limit_of_the_graph_leads_to_a_problem_with_the_cost_of_more() {
+fn an_agent_at_a_limit_of_the_graph_is_a_problem_with_the_memory_of_a_higher_limit() {
     let full = r#"{"ready":true,"version":"1.0.0","source":"host","watches_kept":true,
             "limits":[{"limit":"participants","cap":1000,"used":1000,"reached":345,"at_limit":true},
             {"limit":"topics","cap":1000,"used":900,"reached":3,"at_limit":false},

@@ -141,11 +141,11 @@ fn a_filter_is_evaluated_on_the_selected_field() {
 fn a_writer_of_unreadable_messages_is_reported_once() {
     let mut echo = Echo::new(Options::default());
     let message_type = message_type();
-    let mut tell = |payload: &[u8]| {
+    let mut printed_for = |payload: &[u8]| {
         let printed = echo.message(&sample(), Some(&message_type), payload);
         printed.unwrap()
     };
-    let first = tell(&payload()[..30]);
+    let first = printed_for(&payload()[..30]);
     assert_eq!(first.out, None);
     assert!(
         first
@@ -153,8 +153,8 @@ fn a_writer_of_unreadable_messages_is_reported_once() {
             .starts_with("rp: /a of writer 01.02: a message cannot be decoded as a/msg/B: "),
         "{first:?}"
     );
-    assert_eq!(tell(&[]), MessageText::default());
-    assert!(tell(&payload()).out.is_some());
+    assert_eq!(printed_for(&[]), MessageText::default());
+    assert!(printed_for(&payload()).out.is_some());
     assert_eq!(echo.unreadable(), 2);
 }
 

@@ -49,7 +49,7 @@ impl Sizes {
     }
 
     /// Adds a message that arrived at `time`, in nanoseconds.
-    pub fn arrived(&mut self, time: i64, size: u32) {
+    pub fn add_message(&mut self, time: i64, size: u32) {
         self.sizes.push(i64::from(size));
         self.times.push(time);
         self.newest = time;
@@ -147,9 +147,9 @@ mod tests {
     #[test]
     fn the_interval_of_a_bandwidth_reaches_to_the_present() {
         let mut sizes = Sizes::new(100);
-        sizes.arrived(10 * SECOND, 28);
+        sizes.add_message(10 * SECOND, 28);
         assert_eq!(sizes.report(11 * SECOND), Ok(None));
-        sizes.arrived(10 * SECOND + SECOND / 2, 32);
+        sizes.add_message(10 * SECOND + SECOND / 2, 32);
         let text = |sizes: &mut Sizes, now| sizes.report(now).unwrap().unwrap().lines();
         assert_eq!(
             text(&mut sizes, 11 * SECOND),
@@ -164,7 +164,7 @@ mod tests {
     fn all_numbers_of_a_report_have_one_unit() {
         let mut sizes = Sizes::new(100);
         for _ in 0..3 {
-            sizes.arrived(SECOND, 644_148);
+            sizes.add_message(SECOND, 644_148);
         }
         let text = |sizes: &mut Sizes, now| sizes.report(now).unwrap().unwrap().lines();
         assert_eq!(
@@ -177,8 +177,8 @@ mod tests {
     #[test]
     fn a_clock_set_back_empties_the_window() {
         let mut sizes = Sizes::new(100);
-        sizes.arrived(10 * SECOND, 1);
-        sizes.arrived(11 * SECOND, 1);
+        sizes.add_message(10 * SECOND, 1);
+        sizes.add_message(11 * SECOND, 1);
         assert_eq!(sizes.report(10 * SECOND), Err(TimeReset));
         assert_eq!(sizes.report(12 * SECOND), Ok(None));
     }

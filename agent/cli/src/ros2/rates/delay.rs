@@ -43,7 +43,7 @@ impl Ages {
 
     /// Adds a message. The first message is not counted. A message earlier than the first restarts
     /// the measurement, since the clock was set back.
-    pub fn arrived(&mut self, time: i64, stamp: i64) {
+    pub fn add_message(&mut self, time: i64, stamp: i64) {
         if self.first.is_none_or(|first| first > time) {
             self.first = Some(time);
             self.ages.clear();
@@ -54,7 +54,7 @@ impl Ages {
     }
 
     /// Records a message whose stamp was not seen. The known ages are then reported again.
-    pub fn passed(&mut self, time: i64) {
+    pub fn add_unstamped(&mut self, time: i64) {
         self.newest = self.newest.max(time);
     }
 
@@ -105,28 +105,28 @@ mod tests {
     #[test]
     fn the_first_message_is_not_counted() {
         let mut ages = Ages::new(10);
-        ages.arrived(1000 * MILLISECOND, 500 * MILLISECOND);
+        ages.add_message(1000 * MILLISECOND, 500 * MILLISECOND);
         assert_eq!(ages.lines(), None);
-        ages.arrived(1100 * MILLISECOND, 1099 * MILLISECOND);
-        ages.arrived(1200 * MILLISECOND, 1197 * MILLISECOND);
+        ages.add_message(1100 * MILLISECOND, 1099 * MILLISECOND);
+        ages.add_message(1200 * MILLISECOND, 1197 * MILLISECOND);
         // 1 ms and 3 ms: the mean is 2 ms, and each differs from it by 1 ms.
         let text = "average delay: 0.002\n\tmin: 0.001s max: 0.003s std dev: 0.00100s window: 2\n";
         assert_eq!(ages.lines().as_deref(), Some(text));
         assert_eq!(ages.lines().as_deref(), Some("no new messages\n"));
-        ages.arrived(1300 * MILLISECOND, 1300 * MILLISECOND);
+        ages.add_message(1300 * MILLISECOND, 1300 * MILLISECOND);
         assert!(ages.lines().unwrap().ends_with("window: 3\n"));
     }
 
     #[test]
     fn messages_with_an_unseen_stamp_count_as_new_messages() {
         let mut ages = Ages::new(10);
-        ages.passed(900 * MILLISECOND);
+        ages.add_unstamped(900 * MILLISECOND);
         assert_eq!(ages.lines(), None);
         for at in [1000, 1100] {
-            ages.arrived(at * MILLISECOND, (at - 2) * MILLISECOND);
+            ages.add_message(at * MILLISECOND, (at - 2) * MILLISECOND);
         }
         let text = ages.lines().unwrap();
-        ages.passed(1200 * MILLISECOND);
+        ages.add_unstamped(1200 * MILLISECOND);
         assert_eq!(ages.lines(), Some(text));
         assert_eq!(ages.lines().as_deref(), Some("no new messages\n"));
     }
@@ -134,8 +134,8 @@ mod tests {
     #[test]
     fn a_stamp_in_the_future_leads_to_a_negative_delay() {
         let mut ages = Ages::new(10);
-        ages.arrived(1000 * MILLISECOND, 0);
-        ages.arrived(1000 * MILLISECOND, 1000 * MILLISECOND + 400_000);
+        ages.add_message(1000 * MILLISECOND, 0);
+        ages.add_message(1000 * MILLISECOND, 1000 * MILLISECOND + 400_000);
         // Half a millisecond and less rounds to a zero that keeps its sign, as in ros2cli.
         let text =
             "average delay: -0.000\n\tmin: -0.000s max: -0.000s std dev: 0.00000s window: 1\n";

@@ -43,7 +43,7 @@ impl Intervals {
 
     /// Adds a message. The first message begins the measurement. A message earlier than the first
     /// restarts it, since the clock was set back.
-    pub fn arrived(&mut self, time: i64) {
+    pub fn add_message(&mut self, time: i64) {
         if self.first.is_none_or(|first| first > time) {
             self.first = Some(time);
             self.between.clear();
@@ -117,7 +117,7 @@ mod tests {
     const START: i64 = 1_795_142_000_000_000_000;
 
     fn at(intervals: &mut Intervals, milliseconds: i64) -> Option<String> {
-        intervals.arrived(START + milliseconds * 1_000_000);
+        intervals.add_message(START + milliseconds * 1_000_000);
         intervals.report_at_message().map(|rate| rate.lines())
     }
 
@@ -165,7 +165,7 @@ mod tests {
         at(&mut intervals, 10_000);
         at(&mut intervals, 10_100);
         assert_eq!(at(&mut intervals, 5_000), None);
-        intervals.arrived(START + 5_500 * 1_000_000);
+        intervals.add_message(START + 5_500 * 1_000_000);
         let rate = intervals.report_at_second().unwrap();
         assert_eq!((rate.rate.as_str(), rate.window.as_str()), ("2.000", "1"));
     }
@@ -173,8 +173,8 @@ mod tests {
     #[test]
     fn messages_at_the_same_instant_have_a_rate_of_zero() {
         let mut intervals = Intervals::new(100);
-        intervals.arrived(START);
-        intervals.arrived(START);
+        intervals.add_message(START);
+        intervals.add_message(START);
         let rate = intervals.report_at_second().unwrap();
         assert_eq!(rate.rate, "0.000");
     }
@@ -182,9 +182,9 @@ mod tests {
     #[test]
     fn a_second_without_a_message_leads_to_no_report() {
         let mut intervals = Intervals::new(100);
-        intervals.arrived(START);
+        intervals.add_message(START);
         assert_eq!(intervals.report_at_second(), None);
-        intervals.arrived(START + 1);
+        intervals.add_message(START + 1);
         assert!(intervals.report_at_second().is_some());
         assert_eq!(intervals.report_at_second(), None);
     }

@@ -27,12 +27,12 @@ const SECOND: i64 = 1_000_000_000;
 /// One nanosecond in seconds.
 const NANOSECOND: f64 = 1e-9;
 /// Clears a terminal, as `--all` does before each table.
-const CLEAR: &str = "\x1b[H\x1b[2J\n";
+const CLEAR_SCREEN: &str = "\x1b[H\x1b[2J\n";
 /// Maximum step of the clock. A larger step means that the clock was set, and skipped seconds are
 /// not reported.
 const LONGEST_JUMP: i64 = 3600 * SECOND;
 /// Maximum number of messages that wait for the clock, which ticks ten times a second.
-const WAITING: usize = 65_536;
+const MAX_WAITING: usize = 65_536;
 
 /// Measured quantity.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -175,7 +175,7 @@ impl Rates {
         if self.all {
             let present = present.iter();
             let present: Vec<_> = present
-                .filter(|(_, types)| self.measurable(types))
+                .filter(|(_, types)| self.is_measurable(types))
                 .collect();
             if present.is_empty() {
                 self.output.out.push_str("No topics available\n");
@@ -219,10 +219,10 @@ impl Rates {
     ///
     /// Fails if the topic has several types.
     pub fn appeared(&mut self, name: &str, types: &[String]) -> Result<(), End> {
-        if self.all && !self.places.contains_key(name) && self.measurable(types) {
+        if self.all && !self.places.contains_key(name) && self.is_measurable(types) {
             self.add(Named::absolute(name));
         }
-        let many = self.many();
+        let many = self.is_multi_topic();
         let Some(watched) = self
             .places
             .get(name)
@@ -258,7 +258,7 @@ impl Rates {
     /// # Errors
     ///
     /// Fails if the delay is measured and the message has no header.
-    pub fn arrived(&mut self, name: &str, arrival: Arrival) -> Result<(), End> {
+    pub fn add_message(&mut self, name: &str, arrival: Arrival) -> Result<(), End> {
         let Some(place) = self.places.get(name).copied() else {
             return Ok(());
         };
@@ -273,7 +273,7 @@ impl Rates {
         if self.quantity == Quantity::Delay && arrival.header_stamp.is_none() && !has_header() {
             return Err(End::Refused(Refused("msg does not have header".to_owned())));
         }
-        if self.waiting.len() >= WAITING {
+        if self.waiting.len() >= MAX_WAITING {
             self.settle(arrival.time);
         }
         self.waiting.push((arrival, place));
@@ -286,13 +286,13 @@ impl Rates {
         self.tick(now);
     }
 
-    /// Adds a message as [`Self::arrived`] does, with its number. A sampled message counts at the
-    /// time of the writer's timestamp, except for a delay. Messages between it and the writer's
+    /// Adds a message as [`Self::add_message`] does, with its number. A sampled message counts at
+    /// the time of the writer's timestamp, except for a delay. Messages between it and the writer's
     /// last one also count, at interpolated times.
     ///
     /// # Errors
     ///
-    /// Fails as [`Self::arrived`] does.
+    /// Fails as [`Self::add_message`] does.
     pub fn arrived_from(
         &mut self,
         name: &str,
@@ -324,7 +324,7 @@ impl Rates {
             Place::Counted => return Ok(()),
             Place::After { unseen, since } => self.unseen(name, place, arrival, unseen, since),
         }
-        self.arrived(name, arrival)
+        self.add_message(name, arrival)
     }
 
     /// Counts messages that were sent between `since` and `arrival`.
@@ -379,22 +379,22 @@ impl Rates {
     }
 
     fn count(&mut self, arrival: &Arrival, place: usize) {
-        let reported_at_message = self.reported_at_message();
+        let reported_at_message = self.is_reported_at_message();
         match self
             .topics
             .get_mut(place)
             .map(|watched| &mut watched.series)
         {
             Some(Series::Rate(intervals)) => {
-                intervals.arrived(arrival.time);
+                intervals.add_message(arrival.time);
                 if reported_at_message && let Some(rate) = intervals.report_at_message() {
                     self.output.out.push_str(&rate.lines());
                 }
             }
-            Some(Series::Bandwidth(sizes)) => sizes.arrived(arrival.time, arrival.size),
+            Some(Series::Bandwidth(sizes)) => sizes.add_message(arrival.time, arrival.size),
             Some(Series::Delay(ages)) => match arrival.header_stamp {
-                Some(stamp) => ages.arrived(arrival.time, stamp),
-                None => ages.passed(arrival.time),
+                Some(stamp) => ages.add_message(arrival.time, stamp),
+                None => ages.add_unstamped(arrival.time),
             },
             None => {}
         }
@@ -402,7 +402,8 @@ impl Rates {
 
     /// Emits all periodic reports due up to this time.
     fn tick(&mut self, now: i64) {
-        if self.reported_at_message() || self.topics.iter().all(|one| one.message_type.is_none()) {
+        if self.is_reported_at_message() || self.topics.iter().all(|one| one.message_type.is_none())
+        {
             return;
         }
         let next = match self.next {
@@ -447,23 +448,23 @@ impl Rates {
     }
 
     /// Returns whether a topic can be measured. With `--all`, delays need a type with a header.
-    fn measurable(&self, types: &[String]) -> bool {
+    fn is_measurable(&self, types: &[String]) -> bool {
         let mut types = types.iter();
         self.quantity != Quantity::Delay || types.any(|one| begins_with_header(one))
     }
 
-    fn many(&self) -> bool {
+    fn is_multi_topic(&self) -> bool {
         self.topics.len() > 1
     }
 
-    fn reported_at_message(&self) -> bool {
+    fn is_reported_at_message(&self) -> bool {
         let at_message = self.quantity == Quantity::Rate && self.dialect < Dialect::Kilted;
-        at_message && !self.all && !self.many()
+        at_message && !self.all && !self.is_multi_topic()
     }
 
     fn clear(&mut self) {
         if self.all {
-            self.output.out.push_str(CLEAR);
+            self.output.out.push_str(CLEAR_SCREEN);
         }
     }
 
@@ -478,7 +479,7 @@ impl Rates {
     }
 
     fn rates(&mut self) -> String {
-        let many = self.many();
+        let many = self.is_multi_topic();
         let mut rows = Vec::new();
         for watched in &mut self.topics {
             let Series::Rate(intervals) = &mut watched.series else {
@@ -518,7 +519,7 @@ impl Rates {
     }
 
     fn bandwidths(&mut self, now: i64) -> String {
-        let many = self.many();
+        let many = self.is_multi_topic();
         let new_only = many || self.all || self.dialect >= Dialect::Rolling;
         let mut rows = Vec::new();
         for watched in &mut self.topics {
@@ -563,7 +564,7 @@ impl Rates {
     }
 
     fn delays(&mut self) -> String {
-        let many = self.many();
+        let many = self.is_multi_topic();
         let mut rows = Vec::new();
         for watched in &mut self.topics {
             let Series::Delay(ages) = &mut watched.series else {

@@ -14,13 +14,13 @@ use super::SECOND;
 const MAX_UNSEEN: u64 = 10_000;
 /// Maximum distance of a late message's number from the newest number. A lower number belongs to a
 /// restarted writer.
-const LATE: u64 = 256;
+const MAX_LATE_DISTANCE: u64 = 256;
 /// Maximum time by which a message is late.
-const LATE_FOR: i64 = 2 * SECOND;
+const MAX_LATENESS: i64 = 2 * SECOND;
 /// Maximum time from a writer's timestamp to the poll that finds the message.
 const LONGEST_POLL: i64 = 10 * SECOND;
 /// Maximum number of remembered gaps, whose messages may still be seen.
-const GAPS: usize = 16;
+const MAX_GAPS: usize = 16;
 
 /// A message of the writer.
 #[derive(Clone, Copy, Debug)]
@@ -94,7 +94,7 @@ impl Numbers {
     pub(super) fn place(&mut self, message: Message) -> Place {
         let newest = self.newest;
         if message.number <= newest.number {
-            return self.late(message);
+            return self.add_late(message);
         }
         self.newest = message;
         if !self.has_begun {
@@ -111,7 +111,7 @@ impl Numbers {
         if !may_be_unseen || !(1..=MAX_UNSEEN).contains(&unseen) {
             return Place::Counts;
         }
-        if self.unseen.len() >= GAPS {
+        if self.unseen.len() >= MAX_GAPS {
             self.unseen.pop_front();
         }
         let gap = newest.number + 1..=message.number - 1;
@@ -123,14 +123,14 @@ impl Numbers {
     }
 
     /// Adds a message with a number that is not above the newest one.
-    fn late(&mut self, message: Message) -> Place {
+    fn add_late(&mut self, message: Message) -> Place {
         let newest = self.newest;
         let is_unseen = |gap: &RangeInclusive<u64>| gap.contains(&message.number);
         if self.unseen.iter().any(is_unseen) {
             return Place::Counted;
         }
-        let is_late = newest.number - message.number < LATE
-            && message.captured.saturating_sub(newest.captured) < LATE_FOR;
+        let is_late = newest.number - message.number < MAX_LATE_DISTANCE
+            && message.captured.saturating_sub(newest.captured) < MAX_LATENESS;
         match (is_late, message.is_sampled) {
             // The message is a duplicate, or was sent before the measurement.
             (true, true) => Place::Counted,

@@ -24,9 +24,9 @@ fn the_numbers_of_reports_are_those_of_python() {
         let mut sizes = Sizes::new(case.window);
         let mut ages = Ages::new(case.window);
         for (time, size, stamp) in case.messages {
-            intervals.arrived(START + time);
-            sizes.arrived(START + time, size);
-            ages.arrived(START + time, START + stamp);
+            intervals.add_message(START + time);
+            sizes.add_message(START + time, size);
+            ages.add_message(START + time, START + stamp);
         }
         let found = match case.kind.as_str() {
             "hz" => intervals.report_at_second().unwrap().lines(),
@@ -61,7 +61,7 @@ fn messages(rates: &mut Rates, name: &str, times: impl IntoIterator<Item = i64>)
             size: 100,
             header_stamp,
         };
-        rates.arrived(name, arrival).unwrap();
+        rates.add_message(name, arrival).unwrap();
         rates.clock(at(time));
     }
     rates.take().out
@@ -203,7 +203,7 @@ fn each_bandwidth_of_several_topics_has_its_own_unit() {
             size: 4096,
             header_stamp: None,
         };
-        rates.arrived("/b", arrival).unwrap();
+        rates.add_message("/b", arrival).unwrap();
     }
     rates.clock(at(1000));
     let expected = "\
@@ -225,14 +225,14 @@ fn all_topics_include_topics_that_appear_later() {
         "Subscribing to all 2 available topics...\nSubscribed to [/a]\nSubscribed to [/b]\n";
     assert_eq!(rates.take().out, begin);
     rates.clock(at(0));
-    assert_eq!(rates.take().out, CLEAR);
+    assert_eq!(rates.take().out, CLEAR_SCREEN);
     rates.appeared("/late", &[STRING.to_owned()]).unwrap();
     let text = messages(&mut rates, "/late", [100, 200]);
     assert_eq!(text, "Subscribed to [/late]\n");
     rates.clock(at(1000));
     let table = rates.take().out;
     assert!(
-        table.starts_with(CLEAR) && table.contains("\n/late   10.000"),
+        table.starts_with(CLEAR_SCREEN) && table.contains("\n/late   10.000"),
         "{table}"
     );
 }
@@ -268,7 +268,7 @@ fn a_message_without_a_header_ends_the_measurement_of_a_delay() {
         header_stamp: None,
     };
     let expected = Err(End::Refused(Refused("msg does not have header".to_owned())));
-    assert_eq!(rates.arrived("/chatter", arrival), expected);
+    assert_eq!(rates.add_message("/chatter", arrival), expected);
     assert_eq!(rates.take().out, "");
 }
 
@@ -285,7 +285,7 @@ fn messages_count_in_the_order_of_their_times() {
             size: 100,
             header_stamp: None,
         };
-        rates.arrived("/imu", arrival).unwrap();
+        rates.add_message("/imu", arrival).unwrap();
         rates.clock(at(time - 100));
     }
     let text = "average rate: 10.000\n\tmin: 0.100s max: 0.100s std dev: 0.00000s window: 11\n";
@@ -374,7 +374,7 @@ fn a_sampled_rate_is_correct_in_the_first_report_despite_late_polls() {
 }
 
 #[test]
-fn a_clock_step_leads_neither_to_many_reports_nor_to_none() {
+fn a_clock_step_forward_causes_one_report_and_a_step_back_a_warning() {
     let mut rates = Rates::of(Quantity::Bandwidth, Dialect::Humble, 100, named(&["/imu"]));
     rates.opened(&present(&[("/imu", IMU)])).unwrap();
     rates.clock(at(0));

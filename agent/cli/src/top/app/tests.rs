@@ -120,7 +120,7 @@ fn the_selection_follows_its_topic_and_requests_details_once() {
     assert_eq!(press(&mut app, KeyCode::Down), [Command::Select(key("/b"))]);
     assert_eq!(keys(&mut app, "s"), []);
     assert_eq!(
-        (app.selected.clone(), app.place_of_selected()),
+        (app.selected.clone(), app.selected_index()),
         (key("/b"), Some(0))
     );
     assert_eq!(press(&mut app, KeyCode::End), [Command::Select(key("/d"))]);

@@ -231,7 +231,9 @@ fn the_screens_match_the_reviewed_texts() {
     };
     let imu = details(0);
     shown.selected = Some(key.clone());
-    shown.holds.insert(key.clone(), MeasuredBy::Session);
+    shown
+        .measured_topics
+        .insert(key.clone(), MeasuredBy::Session);
     press(&mut shown, "\ne");
     shown.take(Fact::Details(key, Some(Box::new(imu))), now);
     compare("details-80x24", &screen(&mut shown, (80, 24), ASCII, now));
@@ -245,7 +247,7 @@ fn the_screens_match_the_reviewed_texts() {
 }
 
 #[test]
-fn an_agent_that_is_blind_or_gone_never_looks_healthy() {
+fn a_blind_or_unreachable_agent_never_appears_healthy() {
     let start = Instant::now();
     let at = |seconds: u64| start + Duration::from_secs(seconds);
     let mut shown = app(start);

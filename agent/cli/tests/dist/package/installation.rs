@@ -57,9 +57,9 @@ pub(crate) fn built(directory: &Path, options: &[&str]) -> Result<PathBuf> {
         .arg(&binary)
         .arg(directory)
         .args(options);
-    let said = succeed(&mut build)?;
+    let printed = succeed(&mut build)?;
     std::fs::remove_file(&binary)?;
-    Ok(PathBuf::from(said.trim()))
+    Ok(PathBuf::from(printed.trim()))
 }
 
 /// Returns the same package with a higher version and another default configuration.

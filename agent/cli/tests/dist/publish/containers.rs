@@ -1,5 +1,5 @@
-//! podman runs the commands of `docs/containers.md`. One agent in a container observes a robot on the
-//! host. Others, on the host and in a sidecar, observe a robot in a container.
+//! podman runs the commands of `docs/containers.md`. One agent in a container observes a robot on
+//! the host. Others, on the host and in a sidecar, observe a robot in a container.
 
 use std::path::Path;
 use std::process::Command;
@@ -28,8 +28,8 @@ const PATIENCE: Duration = Duration::from_secs(30);
 /// Maximum time of the kernel to verify the programs.
 const READY: Duration = Duration::from_secs(60);
 
-/// Returns a stream of Fast DDS through shared memory, its default between processes of one host. Each
-/// test has a topic of its own, because the agents observe the whole host.
+/// Returns a stream of Fast DDS through shared memory, its default between processes of one host.
+/// Each test has a topic of its own, because the agents observe the whole host.
 fn stream(topic: &str) -> Stream {
     Stream {
         topic: topic.to_owned(),
@@ -41,10 +41,10 @@ fn stream(topic: &str) -> Stream {
     }
 }
 
-/// Starts a publisher and a subscriber behind a command prefix, and waits until all agents know both.
-/// Names are announced once in shared memory, and an agent on a busy machine may miss them: then the
-/// one in the container requests them, as the page describes.
-fn known(
+/// Starts a publisher and a subscriber behind a command prefix, and waits until all agents know
+/// both. Names are announced once in shared memory, and an agent on a busy machine may miss them:
+/// then the one in the container requests them, as the page describes.
+fn wait_discovered(
     podman: &Podman,
     enter: &[String],
     topic: &str,
@@ -78,7 +78,7 @@ fn known(
 
 /// Sends the messages, and checks that each agent has counted them.
 fn counted(publisher: &mut Peer, topic: &str, agents: &[&Agent<'_>]) -> Result<()> {
-    publisher.go()?;
+    publisher.start_sending()?;
     publisher.wait_sent(PATIENCE)?;
     for agent in agents {
         let page = agent.settled_scrape(topic, MESSAGES)?;
@@ -97,8 +97,8 @@ fn counted(publisher: &mut Peer, topic: &str, agents: &[&Agent<'_>]) -> Result<(
     Ok(())
 }
 
-/// Makes the profile of the page in a directory, and returns the option for it. The default profile of
-/// podman 4.3 refuses `bpf`.
+/// Makes the profile of the page in a directory, and returns the option for it. The default profile
+/// of podman 4.3 refuses `bpf`.
 pub(super) fn seccomp(directory: &Path) -> Result<String> {
     let text = std::fs::read_to_string(page())?;
     let command = text.lines().find(|line| line.starts_with("jq "));
@@ -110,7 +110,7 @@ pub(super) fn seccomp(directory: &Path) -> Result<String> {
 }
 
 /// Starts `rp run` in a container, and waits until it is ready.
-pub(super) fn contained<'h>(
+pub(super) fn start_in_container<'h>(
     podman: &Podman,
     options: &Options,
     host: &'h Namespace,
@@ -125,15 +125,16 @@ pub(super) fn contained<'h>(
 #[ignore = "looks at a release: make release"]
 fn a_robot_on_the_host_is_observed_from_a_container() -> Result<()> {
     let topic = "/beside_a_container";
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let memory = SharedMemory::of(&host, 64)?;
     let podman = Podman::load(&memory.inside(&host))?;
     let directory = tempfile::tempdir()?;
     let options = Options::documented("--network host")?
         .with("--name", AGENT)
         .with("--security-opt", &seccomp(directory.path())?);
-    let mut agent = contained(&podman, &options, &host)?;
-    let (mut publisher, _subscriber) = known(&podman, &memory.inside(&host), topic, &[&agent])?;
+    let mut agent = start_in_container(&podman, &options, &host)?;
+    let (mut publisher, _subscriber) =
+        wait_discovered(&podman, &memory.inside(&host), topic, &[&agent])?;
     counted(&mut publisher, topic, &[&agent])?;
     let mut list = podman.command("exec");
     let list = succeed(list.args([AGENT, "rp", "topic", "list"]))?;
@@ -152,7 +153,7 @@ fn a_robot_on_the_host_is_observed_from_a_container() -> Result<()> {
 #[ignore = "looks at a release: make release"]
 fn a_robot_in_a_container_is_observed_from_the_host_and_from_a_sidecar() -> Result<()> {
     let topic = "/in_a_container";
-    let (network, machine) = (Namespace::alone()?, Namespace::alone()?);
+    let (network, machine) = (Namespace::isolated()?, Namespace::isolated()?);
     let podman = Podman::load(&[])?;
     let root = robot_root()?;
     let peers = Stack::Fast.program()?;
@@ -186,14 +187,14 @@ fn a_robot_in_a_container_is_observed_from_the_host_and_from_a_sidecar() -> Resu
             &format!("{mounted}:/etc/ros2probe/ros2probe.yaml:ro"),
         )
         .with("--security-opt", &seccomp(directory.path())?);
-    let sidecar = contained(&podman, &sidecar, &network)?;
+    let sidecar = start_in_container(&podman, &sidecar, &network)?;
 
     let agents = [&on_host, &sidecar];
     let mut exec = podman.enter().to_vec();
     exec.push(Podman::program().display().to_string());
     exec.extend(podman.arguments("exec"));
     exec.extend(["--interactive", "robot"].map(str::to_owned));
-    let (mut publisher, _subscriber) = known(&podman, &exec, topic, &agents)?;
+    let (mut publisher, _subscriber) = wait_discovered(&podman, &exec, topic, &agents)?;
     counted(&mut publisher, topic, &agents)
 }
 

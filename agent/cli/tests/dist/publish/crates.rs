@@ -16,7 +16,7 @@ use crate::crates;
 
 #[test]
 #[ignore = "looks at a release: make release"]
-fn cargo_installs_rp_from_the_published_crates_and_leaves_nothing() -> Result<()> {
+fn cargo_installs_rp_from_the_published_crates_and_uninstalls_it_completely() -> Result<()> {
     let directory = tempfile::tempdir()?;
     let registry = directory.path().join("registry");
     // The libraries of others are copies of what the registry has.
@@ -43,7 +43,7 @@ fn cargo_installs_rp_from_the_published_crates_and_leaves_nothing() -> Result<()
         cargo.env("CARGO_TARGET_DIR", directory.path().join("target"));
         cargo
     };
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let began = Instant::now();
     let mut install = cargo("install");
     // Only the speed of the program depends on the profile.

@@ -58,10 +58,10 @@ fn the_feed_names_the_version_and_the_checksums_of_all_files_beside_it() -> Resu
 
     let binary = directory.join(format!("rp-{VERSION}-{}", std::env::consts::ARCH));
     let mut check = Command::new(&binary);
-    let said = succeed(check.args(["upgrade", "--check", "--feed"]).arg(&path))?;
-    ensure!(said.contains("is the newest version"), "{said}");
-    let said = upgrade(&binary, &directory)?;
-    ensure!(said.contains("installed as the file"), "{said}");
-    ensure!(said.contains("sudo install -m 755 "), "{said}");
+    let printed = succeed(check.args(["upgrade", "--check", "--feed"]).arg(&path))?;
+    ensure!(printed.contains("is the newest version"), "{printed}");
+    let printed = upgrade(&binary, &directory)?;
+    ensure!(printed.contains("installed as the file"), "{printed}");
+    ensure!(printed.contains("sudo install -m 755 "), "{printed}");
     Ok(())
 }

@@ -209,8 +209,8 @@ fn skopeo_reads_both_architectures() -> Result<()> {
             "--override-arch",
             architecture,
         ]);
-        let said = succeed(skopeo.arg(format!("oci-archive:{}", image()?.display())))?;
-        let image: Value = serde_json::from_str(&said)?;
+        let printed = succeed(skopeo.arg(format!("oci-archive:{}", image()?.display())))?;
+        let image: Value = serde_json::from_str(&printed)?;
         ensure!(image["Architecture"] == architecture, "{image}");
         ensure!(image["Labels"]["org.opencontainers.image.title"] == "ros2probe");
     }

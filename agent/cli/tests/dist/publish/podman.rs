@@ -11,8 +11,8 @@ use ros2probe_testing::repository as sources;
 
 use super::{VERSION, succeed, tool};
 
-/// A storage with the image of the release. podman runs in a mount namespace that has only version 2
-/// of the control groups, and crun puts containers into no group: otherwise both need rights that
+/// A storage with the image of the release. podman runs in a mount namespace that has only version
+/// 2 of the control groups, and crun puts containers into no group: otherwise both need rights that
 /// this machine may lack. Dropping the value removes the containers and volumes.
 pub struct Podman {
     /// Command prefix of each call, such as that of a host, with the mount namespace.
@@ -48,10 +48,10 @@ impl Podman {
             _keeper: keeper,
             image: String::new(),
         };
-        let said = succeed(podman.command("load").arg("--input").arg(super::image()?))?;
-        let (_, name) = said.trim().rsplit_once(' ').context("not loaded")?;
+        let printed = succeed(podman.command("load").arg("--input").arg(super::image()?))?;
+        let (_, name) = printed.trim().rsplit_once(' ').context("not loaded")?;
         podman.image = name.to_owned();
-        ensure!(name.ends_with(&format!("ros2probe:{VERSION}")), "{said}");
+        ensure!(name.ends_with(&format!("ros2probe:{VERSION}")), "{printed}");
         Ok(podman)
     }
 

@@ -38,15 +38,15 @@ fn a_release_without_keys_is_refused_with_the_variable_to_set() -> Result<()> {
         release.env_remove("APT_SIGNING_KEY");
         Ok(release)
     };
-    let said = refuse(&mut release()?)?;
+    let printed = refuse(&mut release()?)?;
     ensure!(
-        said.starts_with("release: MINISIGN_SECRET_KEY must name the file"),
-        "{said}"
+        printed.starts_with("release: MINISIGN_SECRET_KEY must name the file"),
+        "{printed}"
     );
-    let said = refuse(release()?.env("MINISIGN_SECRET_KEY", &key))?;
+    let printed = refuse(release()?.env("MINISIGN_SECRET_KEY", &key))?;
     ensure!(
-        said.starts_with("release: APT_SIGNING_KEY must name the file"),
-        "{said}"
+        printed.starts_with("release: APT_SIGNING_KEY must name the file"),
+        "{printed}"
     );
     succeed(
         release()?
@@ -70,10 +70,10 @@ fn minisign_verifies_the_checksums_of_all_files_and_no_others() -> Result<()> {
         minisign
     };
     let signed = directory.join("SHA256SUMS");
-    let said = succeed(&mut verify(&signed))?;
+    let printed = succeed(&mut verify(&signed))?;
     ensure!(
-        said.contains(&format!("ros2probe {VERSION}, commit ")),
-        "{said}"
+        printed.contains(&format!("ros2probe {VERSION}, commit ")),
+        "{printed}"
     );
 
     let copy = tempfile::tempdir()?;
@@ -81,8 +81,11 @@ fn minisign_verifies_the_checksums_of_all_files_and_no_others() -> Result<()> {
     let text = fs::read_to_string(&signed)?;
     let first = if text.starts_with('0') { "1" } else { "0" };
     fs::write(&changed, format!("{first}{}", text.get(1..).unwrap_or("")))?;
-    let said = refuse(&mut verify(&changed))?;
-    ensure!(said.contains("Signature verification failed"), "{said}");
+    let printed = refuse(&mut verify(&changed))?;
+    ensure!(
+        printed.contains("Signature verification failed"),
+        "{printed}"
+    );
 
     let mut check = Command::new("sha256sum");
     check.args(["--check", "--strict", "--quiet", "SHA256SUMS"]);

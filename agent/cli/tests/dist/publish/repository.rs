@@ -38,7 +38,7 @@ pub(super) fn listen(host: &Debian) -> Result<()> {
 
 /// Fails unless a script fails with this in its output.
 fn refused(host: &Debian, script: &str, expected: &str) -> Result<()> {
-    let output = host.attempt(script)?;
+    let output = host.run_script(script)?;
     ensure!(
         !output.status.success() && all(&output).contains(expected),
         "{script}: {}\n{}",

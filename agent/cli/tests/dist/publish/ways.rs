@@ -1,5 +1,5 @@
-//! Each way to get `rp`: from a fresh host to the first metric of a robot, and back to a host without
-//! a trace.
+//! Each way to get `rp`: from a fresh host to the first metric of a robot, and back to a host
+//! without a trace.
 //!
 //! The durations are printed. Nothing but the patience of a person limits them, because the machine
 //! may be busy.
@@ -18,7 +18,7 @@ use ros2probe_testing::harness::peer::robot;
 use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::wait_within;
 
-use super::containers::{contained, seccomp};
+use super::containers::{seccomp, start_in_container};
 use super::podman::{Options, Podman};
 use super::repository::{ADDRESS, listen, serve};
 use super::{VERSION, package, published, succeed, tool};
@@ -34,7 +34,7 @@ const NETWORK: &str = "ip link set lo multicast on up && \
 /// Prints each path with its type, mode, owner and target, and the checksum of each file in `/etc`.
 /// Left out are file systems in memory, logs, caches of apt, backups, and files that systemd writes
 /// while it runs.
-const TRACE: &str = r"find / -xdev \( -path /proc -o -path /sys -o -path /dev -o -path /run -o -path /tmp \
+const LIST_PATHS: &str = r"find / -xdev \( -path /proc -o -path /sys -o -path /dev -o -path /run -o -path /tmp \
     -o -path /packages -o -path /var/log -o -path /var/cache/apt -o -path /var/lib/apt \
     -o -path '/var/lib/dpkg/*-old' -o -path /var/lib/systemd/timers -o -path /var/lib/systemd/random-seed \
     -o -path /var/lib/private -o -path '/etc/*-' \) -prune -o -printf '%p %y %m %U:%G %l\n' | sort;
@@ -105,16 +105,16 @@ fn report(way: &str, ready: Duration, began: Instant) -> Result<()> {
 }
 
 /// A fresh Debian. The fields are dropped in this order.
-struct Fresh {
+struct FreshDebian {
     host: Debian,
     /// Paths of the host before the installation.
     before: String,
     _directory: tempfile::TempDir,
 }
 
-impl Fresh {
-    /// Starts a host whose `/packages` is a copy of these files of the release. The repository is its
-    /// only source of packages.
+impl FreshDebian {
+    /// Starts a host whose `/packages` is a copy of these files of the release. The repository is
+    /// its only source of packages.
     fn start(start: Start, files: &[PathBuf]) -> Result<Self> {
         let directory = tempfile::tempdir()?;
         serve(directory.path())?;
@@ -128,7 +128,7 @@ impl Fresh {
         succeed(network.args(["sh", "-c", NETWORK]))?;
         listen(&host)?;
         Ok(Self {
-            before: host.run(TRACE)?,
+            before: host.run(LIST_PATHS)?,
             host,
             _directory: directory,
         })
@@ -140,7 +140,7 @@ impl Fresh {
         wait_within(PATIENCE, way, || Ok(get("/readyz").contains("200 OK")))
             .with_context(|| self.log())?;
         let ready = began.elapsed();
-        let robot = Robot::start(&self.host.beside(), topic)?;
+        let robot = Robot::start(&self.host.on_host_network(), topic)?;
         wait_within(PATIENCE, way, || Ok(robot.is_counted(&get("/metrics"))))
             .with_context(|| self.log())?;
         report(way, ready, began)
@@ -169,8 +169,8 @@ impl Fresh {
     }
 
     /// Checks that the host is as before the installation.
-    fn has_no_trace(&self) -> Result<()> {
-        let after = self.host.run(TRACE)?;
+    fn check_unchanged(&self) -> Result<()> {
+        let after = self.host.run(LIST_PATHS)?;
         let before: BTreeSet<&str> = self.before.lines().collect();
         let after: BTreeSet<&str> = after.lines().collect();
         let left: Vec<_> = after.difference(&before).collect();
@@ -189,7 +189,7 @@ const PURGE: &str = "apt-get purge --yes ros2probe && deluser --system ros2probe
 #[test]
 #[ignore = "looks at a release: make release"]
 fn the_repository_for_apt() -> Result<()> {
-    let fresh = Fresh::start(Start::Systemd, &[])?;
+    let fresh = FreshDebian::start(Start::Systemd, &[])?;
     let host = &fresh.host;
     let began = Instant::now();
     host.run(&format!(
@@ -201,29 +201,29 @@ fn the_repository_for_apt() -> Result<()> {
     fresh.measures("repository for apt", "/by_repository", began)?;
     host.run(PURGE)?;
     host.run("rm /etc/apt/keyrings/ros2probe.asc /etc/apt/sources.list.d/ros2probe.list")?;
-    fresh.has_no_trace()
+    fresh.check_unchanged()
 }
 
 #[test]
 #[ignore = "looks at a release: make release"]
-fn the_package() -> Result<()> {
+fn the_package_measures_and_is_removed_without_a_trace() -> Result<()> {
     let own = match std::env::consts::ARCH {
         "aarch64" => package("arm64")?,
         _ => package("amd64")?,
     };
-    let fresh = Fresh::start(Start::Systemd, &[own])?;
+    let fresh = FreshDebian::start(Start::Systemd, &[own])?;
     let began = Instant::now();
     fresh.host.run("apt-get install --yes /packages/*.deb")?;
     fresh.measures("package", "/by_package", began)?;
     fresh.host.run(PURGE)?;
-    fresh.has_no_trace()
+    fresh.check_unchanged()
 }
 
 #[test]
 #[ignore = "looks at a release: make release"]
-fn the_wheel() -> Result<()> {
+fn the_wheel_measures_and_is_removed_without_a_trace() -> Result<()> {
     let wheel = super::wheel::name(std::env::consts::ARCH);
-    let fresh = Fresh::start(Start::Nothing, &[published()?.join(wheel)])?;
+    let fresh = FreshDebian::start(Start::Nothing, &[published()?.join(wheel)])?;
     let began = Instant::now();
     fresh.host.run(
         "python3 -m venv /opt/rp && \
@@ -236,14 +236,14 @@ fn the_wheel() -> Result<()> {
         "/opt/rp/bin/pip uninstall --yes ros2probe && \
          ! find /opt/rp -name '*ros2probe*' -o -name rp -type f | grep . && rm -r /opt/rp",
     )?;
-    fresh.has_no_trace()
+    fresh.check_unchanged()
 }
 
 #[test]
 #[ignore = "looks at a release: make release"]
-fn the_static_binary() -> Result<()> {
+fn the_static_binary_measures_and_is_removed_without_a_trace() -> Result<()> {
     let name = format!("rp-{VERSION}-{}", std::env::consts::ARCH);
-    let fresh = Fresh::start(Start::Nothing, &[published()?.join(&name)])?;
+    let fresh = FreshDebian::start(Start::Nothing, &[published()?.join(&name)])?;
     let began = Instant::now();
     fresh.host.run(&format!(
         "install -m 755 /packages/{name} /usr/local/bin/rp"
@@ -252,20 +252,20 @@ fn the_static_binary() -> Result<()> {
     fresh.measures("static binary", "/by_binary", began)?;
     fresh.end_agent()?;
     fresh.host.run("rm /usr/local/bin/rp")?;
-    fresh.has_no_trace()
+    fresh.check_unchanged()
 }
 
 #[test]
 #[ignore = "looks at a release: make release"]
-fn the_image() -> Result<()> {
-    let host = Namespace::alone()?;
+fn the_image_measures_and_is_removed_without_a_trace() -> Result<()> {
+    let host = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let options = Options::documented("--network host")?
         .with("--name", "way")
         .with("--security-opt", &seccomp(directory.path())?);
     let began = Instant::now();
     let podman = Podman::load(&host.inside())?;
-    let mut agent = contained(&podman, &options, &host)?;
+    let mut agent = start_in_container(&podman, &options, &host)?;
     measures(&agent, "image by podman", "/by_image", began)?;
     let status = agent.process.terminate()?;
     ensure!(status.success(), "{status}");
@@ -291,7 +291,7 @@ fn the_image() -> Result<()> {
 #[test]
 #[ignore = "looks at a release: make release"]
 fn the_packages_for_ros() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let place = directory.path();
     let began = Instant::now();

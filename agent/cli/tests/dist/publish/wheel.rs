@@ -20,7 +20,7 @@ pub(super) fn name(machine: &str) -> String {
 }
 
 /// Makes the wheel of a package.
-fn made(package: &Path, directory: &Path) -> Result<PathBuf> {
+fn build_wheel(package: &Path, directory: &Path) -> Result<PathBuf> {
     let mut script = packaging("wheel.py")?;
     let path = succeed(script.arg(package).arg(directory))?;
     Ok(PathBuf::from(path.trim()))
@@ -63,11 +63,11 @@ fn paths(directory: &Path) -> Result<Vec<String>> {
 fn a_wheel_of_a_package_installs_rp_and_leaves_nothing() -> Result<()> {
     let directory = tempfile::tempdir()?;
     let package = installable(directory.path())?;
-    let wheel = made(&package, directory.path())?;
+    let wheel = build_wheel(&package, directory.path())?;
     let again = directory.path().join("again");
     fs::create_dir(&again)?;
     ensure!(
-        fs::read(&wheel)? == fs::read(made(&package, &again)?)?,
+        fs::read(&wheel)? == fs::read(build_wheel(&package, &again)?)?,
         "the wheels differ"
     );
     installs_and_leaves_nothing(directory.path())
@@ -85,9 +85,15 @@ fn installs_and_leaves_nothing(wheels: &Path) -> Result<()> {
     ensure!(files.contains("../../../bin/rp"), "{files}");
     let python = files.lines().filter(|file| file.ends_with(".py")).count();
     ensure!(python == 0, "{files}");
-    let said = upgrade(&environment.join("bin/rp"), wheels)?;
-    ensure!(said.contains("installed by a Python wheel in "), "{said}");
-    ensure!(said.contains("bin/python3 -m pip install /"), "{said}");
+    let printed = upgrade(&environment.join("bin/rp"), wheels)?;
+    ensure!(
+        printed.contains("installed by a Python wheel in "),
+        "{printed}"
+    );
+    ensure!(
+        printed.contains("bin/python3 -m pip install /"),
+        "{printed}"
+    );
     succeed(pip(&environment).args(["uninstall", "--yes", "ros2probe"]))?;
     ensure!(paths(&environment)? == before, "pip left files behind");
     Ok(())
@@ -105,7 +111,7 @@ fn published_wheels_are_those_of_the_packages_and_follow_the_specification() -> 
     let directory = tempfile::tempdir()?;
     for (machine, architecture) in [("x86_64", "amd64"), ("aarch64", "arm64")] {
         let wheel = published()?.join(name(machine));
-        let again = made(&package(architecture)?, directory.path())?;
+        let again = build_wheel(&package(architecture)?, directory.path())?;
         ensure!(fs::read(&wheel)? == fs::read(again)?, "{machine}");
         let mut twine = Command::new(tool("wheels/bin/twine"));
         let checked = succeed(twine.args(["check", "--strict"]).arg(&wheel))?;
@@ -200,7 +206,7 @@ fn the_printed_command_upgrades_what_uv_and_pipx_have_installed() -> Result<()> 
     let newer = changed(&package(debian)?, directory.path())?;
     let files = directory.path().join("files");
     fs::create_dir(&files)?;
-    made(&newer, &files)?;
+    build_wheel(&newer, &files)?;
     let mut script = packaging("feed.py")?;
     let feed = succeed(script.args(["99.0.0", "0123456789abcdef"]).arg(&files))?;
     fs::write(files.join("release.json"), feed)?;
@@ -261,7 +267,7 @@ fn the_printed_command_upgrades_what_uv_and_pipx_have_installed() -> Result<()> 
 #[test]
 fn links_of_the_readme_are_absolute_in_a_wheel() -> Result<()> {
     let directory = tempfile::tempdir()?;
-    let wheel = made(&installable(directory.path())?, directory.path())?;
+    let wheel = build_wheel(&installable(directory.path())?, directory.path())?;
     let path = format!("ros2probe-{VERSION}.dist-info/METADATA");
     let metadata = succeed(Command::new("unzip").arg("-p").arg(&wheel).arg(path))?;
     let (_, readme) = metadata.split_once("\n\n").context("no description")?;

@@ -38,7 +38,7 @@ impl Filter {
 
     /// Publishes 60 messages: 30 also within the process, and 20 within the callback of a message
     /// that it takes. Calls a timer 20 times.
-    pub(crate) fn work(&mut self) -> Result<()> {
+    pub(crate) fn publish_messages(&mut self) -> Result<()> {
         self.run("publish 10 100")?;
         self.run("both 30")?;
         self.run("timer 20 100")?;

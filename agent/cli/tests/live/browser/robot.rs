@@ -36,7 +36,7 @@ impl Place {
         let directory = tempfile::tempdir()?;
         std::fs::create_dir(directory.path().join("bags"))?;
         Ok(Self {
-            host: Namespace::alone()?,
+            host: Namespace::isolated()?,
             directory,
         })
     }

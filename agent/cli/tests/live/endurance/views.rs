@@ -6,7 +6,7 @@ use super::*;
 pub(super) struct Views<'a> {
     pub(super) agents: Vec<&'a Agent<'a>>,
     /// Dropped frames and the differences of counts that they explain, at the last checkpoint.
-    pub(super) excused: Vec<(f64, Tally, Vec<f64>)>,
+    pub(super) baseline: Vec<(f64, Tally, Vec<f64>)>,
     pub(super) since: Instant,
     pub(super) wrong: Vec<String>,
 }
@@ -15,7 +15,7 @@ impl<'a> Views<'a> {
     pub(super) fn of(agents: &[&'a Agent<'a>]) -> Views<'a> {
         Views {
             agents: agents.to_vec(),
-            excused: vec![Default::default(); agents.len()],
+            baseline: vec![Default::default(); agents.len()],
             since: Instant::now(),
             wrong: Vec::new(),
         }
@@ -25,9 +25,9 @@ impl<'a> Views<'a> {
     pub(super) fn compare<C: Carrier>(&mut self, crowd: &mut Crowd<C>) -> Result<()> {
         for index in 0..self.agents.len() {
             let began = Instant::now();
-            let mut said = None;
+            let mut printed = None;
             loop {
-                crowd.rest(Duration::from_millis(500))?;
+                crowd.idle(Duration::from_millis(500))?;
                 let is_late = began.elapsed() > PATIENCE;
                 if crowd.is_grey() && !is_late {
                     continue;
@@ -37,7 +37,7 @@ impl<'a> Views<'a> {
                 let answer = std::thread::scope(|scope| -> Result<Answer> {
                     let asked = scope.spawn(|| Answer::of(host));
                     while !asked.is_finished() {
-                        crowd.rest(Duration::from_millis(10))?;
+                        crowd.idle(Duration::from_millis(10))?;
                     }
                     asked.join().map_err(|_| anyhow!("nobody asked"))?
                 })?;
@@ -46,7 +46,7 @@ impl<'a> Views<'a> {
                 }
                 // The content of dropped frames is unknown, so endpoints are announced again and
                 // counts differ.
-                let blind = dropped(&answer.page) > self.excused[index].0;
+                let blind = dropped(&answer.page) > self.baseline[index].0;
                 let difference = self.difference(index, crowd, &answer, blind || is_late);
                 let Some(difference) = difference else { break };
                 if is_late {
@@ -55,13 +55,13 @@ impl<'a> Views<'a> {
                     self.wrong.push(text);
                     break;
                 }
-                if blind && said.is_none_or(|at: Instant| at.elapsed() > PATIENCE / 4) {
+                if blind && printed.is_none_or(|at: Instant| at.elapsed() > PATIENCE / 4) {
                     eprintln!(
                         "{} dropped: everything is said again",
                         dropped(&answer.page)
                     );
                     crowd.repeat()?;
-                    said = Some(Instant::now());
+                    printed = Some(Instant::now());
                 }
             }
         }
@@ -70,18 +70,19 @@ impl<'a> Views<'a> {
             "{} s: {} participants of {} compared",
             self.since.elapsed().as_secs(),
             crowd.size(),
-            crowd.born()
+            crowd.participants_created()
         );
         Ok(())
     }
 
-    /// Returns what is wrong in an answer. With `excused`, the present counts become the reference.
+    /// Returns what is wrong in an answer. With `baseline`, the present counts become the
+    /// reference.
     fn difference<C: Carrier>(
         &mut self,
         index: usize,
         crowd: &Crowd<C>,
         answer: &Answer,
-        excused: bool,
+        baseline: bool,
     ) -> Option<String> {
         let (seen, truth, page) = (&answer.graph, &crowd.graph(), &answer.page);
         let counted = |(entity, event): (&str, &str)| {
@@ -96,7 +97,7 @@ impl<'a> Views<'a> {
         let errors: Tally = tally
             .map(|(what, count)| (*what, count.wrapping_sub(counted(*what))))
             .collect();
-        let (unseen, tally_errors, message_errors) = &mut self.excused[index];
+        let (unseen, tally_errors, message_errors) = &mut self.baseline[index];
         let wrong_events: Vec<_> = errors
             .iter()
             .filter(|(what, error)| tally_errors.get(what).unwrap_or(&0) != *error)
@@ -116,7 +117,7 @@ impl<'a> Views<'a> {
         } else {
             None
         };
-        if excused && seen == truth {
+        if baseline && seen == truth {
             *unseen = dropped(page);
             (*tally_errors, *message_errors) = (errors, messages);
         }

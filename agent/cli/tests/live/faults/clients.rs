@@ -20,7 +20,7 @@ const PATIENCE: Duration = Duration::from_secs(60);
 
 /// The agent's addresses, and the token.
 #[derive(Clone)]
-pub(super) struct Doors {
+pub(super) struct AgentAddresses {
     network: PathBuf,
     address: Ipv4Addr,
     pub(super) socket: PathBuf,
@@ -34,7 +34,7 @@ pub(super) struct Clients {
 }
 
 /// Sends requests repeatedly, and keeps the longest time until an answer.
-pub(super) struct Asker {
+pub(super) struct RequestLoop {
     stop: Arc<AtomicBool>,
     thread: JoinHandle<Answers>,
     what: &'static str,
@@ -48,10 +48,10 @@ pub(super) struct Answers {
     pub(super) refused: Vec<String>,
 }
 
-impl Doors {
+impl AgentAddresses {
     /// Returns the doors of an agent on a host. Clients connect on that host.
-    pub(super) fn new(host: &Namespace, socket: &Path, token: &'static str) -> Doors {
-        Doors {
+    pub(super) fn new(host: &Namespace, socket: &Path, token: &'static str) -> AgentAddresses {
+        AgentAddresses {
             network: host.network(),
             address: host.address(),
             socket: socket.to_owned(),
@@ -76,7 +76,7 @@ impl Doors {
 
     /// Returns a request to the API with the token.
     pub(super) fn request(&self, path: &str) -> String {
-        let Doors { address, token, .. } = self;
+        let AgentAddresses { address, token, .. } = self;
         format!(
             "GET {path} HTTP/1.1\r\nHost: {address}:{API_PORT}\r\nAuthorization: Bearer {token}\r\n\r\n"
         )
@@ -85,7 +85,7 @@ impl Doors {
 
 impl Clients {
     /// Starts some clients of every kind.
-    pub(super) fn start(doors: &Doors) -> Clients {
+    pub(super) fn start(doors: &AgentAddresses) -> Clients {
         let mut clients = Clients {
             stop: Arc::default(),
             threads: Vec::new(),
@@ -116,8 +116,8 @@ impl Clients {
     fn add(
         &mut self,
         what: &'static str,
-        doors: &Doors,
-        mut act: impl FnMut(&Doors) -> Result<()> + Send + 'static,
+        doors: &AgentAddresses,
+        mut act: impl FnMut(&AgentAddresses) -> Result<()> + Send + 'static,
     ) {
         let (doors, stop) = (doors.clone(), Arc::clone(&self.stop));
         let count = Arc::<AtomicU64>::default();
@@ -135,13 +135,13 @@ impl Clients {
     }
 }
 
-impl Asker {
+impl RequestLoop {
     /// Sends a request once per `period`, each time on a new connection.
     pub(super) fn start(
         what: &'static str,
         period: Duration,
         mut ask: impl FnMut() -> Result<String> + Send + 'static,
-    ) -> Asker {
+    ) -> RequestLoop {
         let stop = Arc::<AtomicBool>::default();
         let stopped = Arc::clone(&stop);
         let thread = std::thread::spawn(move || {
@@ -159,7 +159,7 @@ impl Asker {
             }
             answers
         });
-        Asker { stop, thread, what }
+        RequestLoop { stop, thread, what }
     }
 
     pub(super) fn end(self) -> Result<(&'static str, Answers)> {
@@ -185,7 +185,7 @@ pub(super) fn answer(
 }
 
 /// Sends heads of 38 KB that never end, on as many connections as both listeners accept.
-fn unfinished() -> impl FnMut(&Doors) -> Result<()> {
+fn unfinished() -> impl FnMut(&AgentAddresses) -> Result<()> {
     let field = format!("x: {}\r\n", "x".repeat(9_500));
     let (mut open, mut number) = (Vec::new(), 0_usize);
     move |doors| {
@@ -209,7 +209,7 @@ fn unfinished() -> impl FnMut(&Doors) -> Result<()> {
 }
 
 /// Sends one request per connection, and keeps the connection open.
-fn idle() -> impl FnMut(&Doors) -> Result<()> {
+fn idle() -> impl FnMut(&AgentAddresses) -> Result<()> {
     let mut open = Vec::new();
     move |doors| {
         if open.len() > 40 {
@@ -225,7 +225,7 @@ fn idle() -> impl FnMut(&Doors) -> Result<()> {
 }
 
 /// Reads 5 KB of a page per second.
-fn slow() -> impl FnMut(&Doors) -> Result<()> {
+fn slow() -> impl FnMut(&AgentAddresses) -> Result<()> {
     let mut open = Vec::new();
     move |doors| {
         while open.len() < 4 {
@@ -239,7 +239,7 @@ fn slow() -> impl FnMut(&Doors) -> Result<()> {
     }
 }
 
-fn compressed(doors: &Doors) -> Result<()> {
+fn compressed(doors: &AgentAddresses) -> Result<()> {
     let head = "GET /metrics HTTP/1.1\r\nHost: localhost:17400\r\nAccept-Encoding: gzip";
     answer(doors.metrics()?, head)?;
     std::thread::sleep(Duration::from_millis(200));
@@ -247,7 +247,7 @@ fn compressed(doors: &Doors) -> Result<()> {
 }
 
 /// Subscribes to as many globs as fit, each with the maximum number of stars.
-fn costly_subscription(doors: &Doors) -> Result<()> {
+fn costly_subscription(doors: &AgentAddresses) -> Result<()> {
     let glob = format!("/{}*", "*a".repeat(15));
     let list = vec![glob; 250].join(",");
     let mut stream = UnixStream::connect(&doors.socket)?;
@@ -260,7 +260,7 @@ fn costly_subscription(doors: &Doors) -> Result<()> {
 }
 
 /// Adds a watch with a costly glob each time, and never removes it.
-fn costly_watch() -> impl FnMut(&Doors) -> Result<()> {
+fn costly_watch() -> impl FnMut(&AgentAddresses) -> Result<()> {
     let mut number = 0;
     move |doors| {
         number += 1;
@@ -274,7 +274,7 @@ fn costly_watch() -> impl FnMut(&Doors) -> Result<()> {
     }
 }
 
-fn without_token(doors: &Doors) -> Result<()> {
+fn without_token(doors: &AgentAddresses) -> Result<()> {
     for _ in 0..10 {
         let head = format!("GET /topics HTTP/1.1\r\nHost: {}:{API_PORT}", doors.address);
         answer(doors.api()?, &head)?;

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use anyhow::{Result, ensure};
 
-use super::{API_PORT, Counted, METRICS_PORT, Scene, ask, request};
+use super::{API_PORT, Counted, FaultBench, METRICS_PORT, ask, request};
 use ros2probe_testing::harness::agent::{ON_THE_WIRE, Scrape};
 use ros2probe_testing::harness::network::Link;
 use ros2probe_testing::harness::soak::{long, outcome};
@@ -32,7 +32,7 @@ fn without_descriptors_only_operations_that_need_one_fail_and_later_recover() ->
         state.display(),
         bags.display()
     );
-    let scene = Scene::start(&link.robot, &directory, &configuration, &[])?;
+    let scene = FaultBench::start(&link.robot, &directory, &configuration, &[])?;
     let mut counted = Counted::start(&link, 1, "before")?;
     scene.node_is_known("/before")?;
     let mut metrics = scene.connect(METRICS_PORT)?;
@@ -52,13 +52,13 @@ fn without_descriptors_only_operations_that_need_one_fail_and_later_recover() ->
     std::thread::sleep(span);
     let cpu = Usage::of(pid)?.since(&before).cpu;
     ensure!(cpu < span / 4, "{cpu:?} of CPU in {span:?}: it spins");
-    counted.talk(320, 300)?;
+    counted.send_samples(320, 300)?;
     let detail = a_recording_is_refused(&mut api, &bags)?;
     let mut late = Counted::start(&link, 2, "meanwhile")?;
     wait_until("a state write that fails", || {
         Ok(writes(&page(&mut metrics)?, "failed") >= 1.0)
     })?;
-    counted.talk(320, 100)?;
+    counted.send_samples(320, 100)?;
     wait_until("all messages", || {
         let label = [("topic", counted.topic.as_str())];
         let count = page(&mut metrics)?.sum("ros2_topic_messages_total", &label);
@@ -110,10 +110,10 @@ fn a_recording_is_refused(api: &mut TcpStream, bags: &Path) -> Result<String> {
 }
 
 /// Checks that a recording of 50 messages has all of them.
-fn a_recording_works(scene: &Scene<'_>, late: &mut Counted) -> Result<()> {
+fn a_recording_works(scene: &FaultBench<'_>, late: &mut Counted) -> Result<()> {
     let (status, begun) = scene.ask("POST", "/recordings", r#"{"name": "some"}"#)?;
     ensure!(status == 201, "{status} {begun}");
-    late.talk(320, 50)?;
+    late.send_samples(320, 50)?;
     let (status, ended) = scene.ask("DELETE", "/recordings/some", "")?;
     ensure!(
         status == 200 && ended["report"]["messages"] == 50,

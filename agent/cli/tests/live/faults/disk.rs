@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, Result, ensure};
 use serde_json::Value;
 
-use super::{Counted, Scene};
+use super::{Counted, FaultBench};
 use ros2probe_testing::harness::agent::{ON_THE_WIRE, Scrape};
 use ros2probe_testing::harness::network::Link;
 use ros2probe_testing::harness::soak::outcome;
@@ -16,7 +16,7 @@ use ros2probe_testing::harness::{run, wait_until};
 
 /// The agent's disk, which only the agent has.
 struct Disk<'a, 'b> {
-    scene: &'a Scene<'b>,
+    scene: &'a FaultBench<'b>,
     /// Path of the disk for the agent.
     place: PathBuf,
     /// Path of the disk for this process.
@@ -99,7 +99,7 @@ impl Disk<'_, '_> {
         let body = format!(r#"{{"name": "{name}"}}"#);
         let (status, begun) = self.scene.ask("POST", "/recordings", &body)?;
         ensure!(status == 201, "{status} {begun}");
-        counted.talk(320, 40)?;
+        counted.send_samples(320, 40)?;
         let path = format!("/recordings/{name}");
         let (status, ended) = self.scene.ask("DELETE", &path, "")?;
         ensure!(
@@ -113,7 +113,7 @@ impl Disk<'_, '_> {
 }
 
 #[test]
-fn a_full_read_only_or_removed_disk_costs_only_the_files_on_it_and_no_message() -> Result<()> {
+fn a_full_read_only_or_removed_disk_loses_only_its_files_and_no_message() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let place = directory.path().join("disk");
@@ -127,7 +127,7 @@ fn a_full_read_only_or_removed_disk_costs_only_the_files_on_it_and_no_message() 
         r#"mount -t tmpfs -o size=3m none "$0" && mkdir "$0/state" "$0/bags" && exec "$@""#;
     let place_name = place.display().to_string();
     let words = ["unshare", "--mount", "sh", "-c", script, &place_name];
-    let scene = Scene::start(&link.robot, &directory, &configuration, &words)?;
+    let scene = FaultBench::start(&link.robot, &directory, &configuration, &words)?;
     let root = format!("/proc/{}/root", scene.pid());
     let disk = Disk {
         scene: &scene,
@@ -140,7 +140,7 @@ fn a_full_read_only_or_removed_disk_costs_only_the_files_on_it_and_no_message() 
 
     let (status, begun) = scene.ask("POST", "/recordings", r#"{"name": "cut"}"#)?;
     ensure!(status == 201, "{status} {begun}");
-    counted.talk(1400, 100)?;
+    counted.send_samples(1400, 100)?;
     wait_until("some of it is on the disk", || {
         let (_, now) = scene.ask("GET", "/recordings/cut", "")?;
         Ok(now["file_bytes"]
@@ -148,7 +148,7 @@ fn a_full_read_only_or_removed_disk_costs_only_the_files_on_it_and_no_message() 
             .is_some_and(|bytes| bytes > 100_000))
     })?;
     disk.fill()?;
-    counted.talk(1400, 900)?;
+    counted.send_samples(1400, 900)?;
     wait_until("the recording ends", || {
         Ok(scene.ask("GET", "/recordings/cut", "")?.1["state"] == "ended")
     })?;

@@ -13,11 +13,11 @@ use anyhow::{Context as _, Result, ensure};
 use ros2probe_capture::netns;
 use serde_json::Value;
 
-use super::clients::{Asker, Clients, Doors, answer};
-use super::memory::{Breathing, NOBODY};
-use super::unit::{Allowance, Confined, mebibytes};
+use super::clients::{AgentAddresses, Clients, RequestLoop, answer};
+use super::memory::{PausingSender, UNUSED_PORT};
+use super::unit::{Allowance, UnitCgroups, mebibytes};
 use super::zenoh_storm::ZenohStorm;
-use super::{Scene, ask};
+use super::{FaultBench, ask};
 use ros2probe_testing::forged::storm::{Storm, forgery};
 use ros2probe_testing::harness::agent::{ON_THE_WIRE, Scrape, at_the_sockets_of};
 use ros2probe_testing::harness::network::{Link, Namespace};
@@ -59,22 +59,22 @@ fn everything(place: &str, capture: impl Fn(&Link) -> String) -> Result<()> {
         // An unoptimized agent takes several times the CPU of the shipped one.
         allowance.cpu_percent *= 2;
     }
-    let group = Confined::to(&allowance)?;
+    let group = UnitCgroups::to(&allowance)?;
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let socket = directory.path().join("api.sock");
     let configuration = configuration(directory.path(), &capture(&link))?;
     let enter = group.enter();
     let words = ["sh", "-c", &enter];
-    let scene = Scene::start(&link.robot, &directory, &configuration, &words)?;
-    let doors = Doors::new(&link.robot, &socket, TOKEN);
+    let scene = FaultBench::start(&link.robot, &directory, &configuration, &words)?;
+    let doors = AgentAddresses::new(&link.robot, &socket, TOKEN);
     let idle = group.needed()?;
-    let mut real = Real::start(&link, span)?;
+    let mut real = RealTraffic::start(&link, span)?;
     scene.node_is_known("/driver")?;
     scene.node_is_known("/camera")?;
     let silent = recordings_and_silent_readers(&doors)?;
     // The socket hook sees datagrams only if a socket receives them. The test never reads it.
-    let _sink = link.robot.hold(|| sink(&link.robot))??;
+    let _sink = link.robot.hold(|| storm_receiver(&link.robot))??;
 
     let (before, throttled) = (Usage::of(scene.pid())?, group.throttled()?);
     let began = Instant::now();
@@ -82,9 +82,9 @@ fn everything(place: &str, capture: impl Fn(&Link) -> String) -> Result<()> {
     let rest = Duration::from_millis(if long().is_some() { 2 } else { 10 });
     let zenoh = ZenohStorm::start(&link, rest)?;
     let clients = Clients::start(&doors);
-    let askers = askers(&doors);
-    real.go()?;
-    let Highest {
+    let askers = well_behaved_clients(&doors);
+    real.start_publishers()?;
+    let PeakUsage {
         mut peak,
         participants,
         endpoints,
@@ -101,9 +101,9 @@ fn everything(place: &str, capture: impl Fn(&Link) -> String) -> Result<()> {
     }
     let declared = zenoh.end()?;
     drop(silent);
-    let page = real.settled(&scene).with_context(|| scene.log())?;
+    let page = real.final_page(&scene).with_context(|| scene.log())?;
     peak = peak.max(group.needed()?);
-    ensure!(group.kills()? == 0, "killed at the end");
+    ensure!(group.oom_kills()? == 0, "killed at the end");
     ensure!(
         peak < allowance.memory / 3 * 2,
         "{peak} bytes with what sockets take"
@@ -114,7 +114,7 @@ fn everything(place: &str, capture: impl Fn(&Link) -> String) -> Result<()> {
     let counted = real.check(&page)?;
     let mut recorded = 0;
     for (name, _) in RECORDINGS {
-        recorded += accounted(&doors, name, &real, dropped(&page) == 0.0)?;
+        recorded += end_recording(&doors, name, &real, dropped(&page) == 0.0)?;
     }
     let ended = scene.end()?;
     outcome(
@@ -155,7 +155,7 @@ fn configuration(directory: &Path, capture: &str) -> Result<String> {
 }
 
 /// The highest values of a span.
-struct Highest {
+struct PeakUsage {
     /// Memory that the group needed, in bytes.
     peak: u64,
     /// Used shares of these tables, from 0 to 1.
@@ -165,7 +165,12 @@ struct Highest {
 }
 
 /// Reads the values until everything is sent, and once more.
-fn observe(span: Duration, group: &Confined, doors: &Doors, real: &mut Real) -> Result<Highest> {
+fn observe(
+    span: Duration,
+    group: &UnitCgroups,
+    doors: &AgentAddresses,
+    real: &mut RealTraffic,
+) -> Result<PeakUsage> {
     let began = Instant::now();
     let mut peak = 0;
     let (mut participants, mut endpoints, mut zenoh_aliases) = (0.0_f64, 0.0_f64, 0.0_f64);
@@ -175,15 +180,19 @@ fn observe(span: Duration, group: &Confined, doors: &Doors, real: &mut Real) -> 
         if is_sent {
             real.wait_sent()?;
         }
-        ensure!(group.kills()? == 0, "killed after {:?}", began.elapsed());
+        ensure!(
+            group.oom_kills()? == 0,
+            "killed after {:?}",
+            began.elapsed()
+        );
         peak = peak.max(group.needed()?);
         let page = page(doors)?;
-        participants = participants.max(filled(&page, "participants"));
-        endpoints = endpoints.max(filled(&page, "endpoints"));
+        participants = participants.max(table_usage(&page, "participants"));
+        endpoints = endpoints.max(table_usage(&page, "endpoints"));
         zenoh_aliases = zenoh_aliases.max(filled_bytes(&page, "zenoh_aliases"));
         std::thread::sleep(Duration::from_millis(200));
     }
-    Ok(Highest {
+    Ok(PeakUsage {
         peak,
         participants,
         endpoints,
@@ -192,10 +201,10 @@ fn observe(span: Duration, group: &Confined, doors: &Doors, real: &mut Real) -> 
 }
 
 /// Begins all recordings, and streams of samples that are never read.
-fn recordings_and_silent_readers(doors: &Doors) -> Result<Vec<std::net::TcpStream>> {
+fn recordings_and_silent_readers(doors: &AgentAddresses) -> Result<Vec<std::net::TcpStream>> {
     for (name, topics) in RECORDINGS {
         let body = format!(r#"{{"name": "{name}"{topics}}}"#);
-        let (status, begun) = on_the_socket(doors, "POST", "/recordings", &body)?;
+        let (status, begun) = socket_request(doors, "POST", "/recordings", &body)?;
         ensure!(status == 201, "{status} {begun}");
     }
     let mut silent = Vec::new();
@@ -210,7 +219,7 @@ fn recordings_and_silent_readers(doors: &Doors) -> Result<Vec<std::net::TcpStrea
 
 /// Returns the number of answers of each client and its longest wait. Fails if an answer was
 /// refused or late.
-fn answers(askers: Vec<Asker>) -> Result<Vec<String>> {
+fn answers(askers: Vec<RequestLoop>) -> Result<Vec<String>> {
     let mut answered = Vec::new();
     for asker in askers {
         let (what, answers) = asker.end()?;
@@ -246,8 +255,9 @@ fn refusals_have_names(page: &Scrape) -> Result<()> {
 fn storms(link: &Link) -> Result<[Storm; 4]> {
     // An unoptimized agent processes fewer messages.
     let (pace, rest) = if long().is_some() { (2, 50) } else { (1, 200) };
-    let breathing = |count: u32| Breathing::resting(link, count * pace, Duration::from_millis(4));
-    let slow = Breathing::resting(link, 1, Duration::from_millis(rest))?;
+    let breathing =
+        |count: u32| PausingSender::with_pauses(link, count * pace, Duration::from_millis(4));
+    let slow = PausingSender::with_pauses(link, 1, Duration::from_millis(rest))?;
     Ok([
         Storm::of_a_crowd(breathing(4)?, 1200, 12),
         Storm::of_addresses(breathing(1)?),
@@ -263,7 +273,7 @@ fn is_busy(answer: &str) -> bool {
 
 /// Reads the metrics without a scraper's timeout. Repeats the request, as a scraper does, while an
 /// unoptimized agent refuses it.
-fn page(doors: &Doors) -> Result<Scrape> {
+fn page(doors: &AgentAddresses) -> Result<Scrape> {
     let head = "GET /metrics HTTP/1.1\r\nHost: localhost:17400";
     let deadline = Instant::now() + SENT;
     let answer = loop {
@@ -278,7 +288,7 @@ fn page(doors: &Doors) -> Result<Scrape> {
 }
 
 /// Returns the used share of a table, from 0 to 1.
-fn filled(page: &Scrape, table: &str) -> f64 {
+fn table_usage(page: &Scrape, table: &str) -> f64 {
     let label = [("table", table)];
     page.sum("ros2probe_table_entries", &label) / page.sum("ros2probe_table_limit", &label)
 }
@@ -291,9 +301,14 @@ fn filled_bytes(page: &Scrape, table: &str) -> f64 {
 
 /// Ends a recording, and returns its number of messages of real topics. The report counts each
 /// other sent message with the reason, except those dropped before the agent knew their topic.
-fn accounted(doors: &Doors, name: &str, real: &Real, is_all: bool) -> Result<u64> {
+fn end_recording(
+    doors: &AgentAddresses,
+    name: &str,
+    real: &RealTraffic,
+    is_all: bool,
+) -> Result<u64> {
     let path = format!("/recordings/{name}");
-    let (status, ended) = on_the_socket(doors, "DELETE", &path, "")?;
+    let (status, ended) = socket_request(doors, "DELETE", &path, "")?;
     ensure!(status == 200, "{status} {ended}");
     let mut recorded = 0;
     for (topic, sent) in real.sent()? {
@@ -310,13 +325,13 @@ fn accounted(doors: &Doors, name: &str, real: &Real, is_all: bool) -> Result<u64
 }
 
 /// Two publishers on the robot, and their subscribers on the other host.
-struct Real {
+struct RealTraffic {
     publishers: Vec<(Peer, &'static str)>,
     _subscribers: Vec<Peer>,
 }
 
-impl Real {
-    fn start(link: &Link, span: Duration) -> Result<Real> {
+impl RealTraffic {
+    fn start(link: &Link, span: Duration) -> Result<RealTraffic> {
         let seconds = span.as_secs();
         let small = Stream {
             topic: "/real".to_owned(),
@@ -330,7 +345,7 @@ impl Real {
             linger: 600.0,
             ..Stream::point_cloud(64_000, 10 * seconds)
         };
-        let mut real = Real {
+        let mut real = RealTraffic {
             publishers: Vec::new(),
             _subscribers: Vec::new(),
         };
@@ -350,10 +365,10 @@ impl Real {
         Ok(real)
     }
 
-    fn go(&mut self) -> Result<()> {
+    fn start_publishers(&mut self) -> Result<()> {
         self.publishers
             .iter_mut()
-            .try_for_each(|(publisher, _)| publisher.go())
+            .try_for_each(|(publisher, _)| publisher.start_sending())
     }
 
     fn wait_sent(&mut self) -> Result<()> {
@@ -372,7 +387,7 @@ impl Real {
     }
 
     /// Returns a page with the final counts of each stream.
-    fn settled(&self, scene: &Scene<'_>) -> Result<Scrape> {
+    fn final_page(&self, scene: &FaultBench<'_>) -> Result<Scrape> {
         let mut page = None;
         for (topic, sent) in self.sent()? {
             page = Some(scene.agent.settled_scrape(topic, sent)?);
@@ -384,7 +399,7 @@ impl Real {
     /// itself loses no message.
     fn check(&self, page: &Scrape) -> Result<String> {
         let dropped = dropped(page);
-        let mut said = Vec::new();
+        let mut printed = Vec::new();
         for (topic, sent) in self.sent()? {
             let label = [("topic", topic)];
             let counted = page.sum("ros2_topic_messages_total", &label);
@@ -393,9 +408,9 @@ impl Real {
             ensure!(
                 (0.0..=dropped).contains(&missing) && (0.0..=missing).contains(&lost),
                 "{topic}: {counted} of {sent}, {lost} lost, {dropped} dropped: {}",
-                page.doubts()
+                page.doubted_jumps()
             );
-            said.push(format!("{counted} of {sent} messages of {topic}"));
+            printed.push(format!("{counted} of {sent} messages of {topic}"));
         }
         let events = page.sum(
             "ros2probe_events_total",
@@ -408,14 +423,14 @@ impl Real {
         );
         Ok(format!(
             "{} counted, {dropped} records or frames dropped",
-            said.join(" and ")
+            printed.join(" and ")
         ))
     }
 }
 
 /// Starts the well-behaved clients: a scraper, a service manager that reads the readiness, a client
 /// with the token, and one on the socket.
-fn askers(doors: &Doors) -> Vec<Asker> {
+fn well_behaved_clients(doors: &AgentAddresses) -> Vec<RequestLoop> {
     let period = Duration::from_millis(500);
     let scrape = |path: &'static str| {
         let doors = doors.clone();
@@ -428,12 +443,12 @@ fn askers(doors: &Doors) -> Vec<Asker> {
     };
     let (with_token, local) = (doors.clone(), doors.clone());
     vec![
-        Asker::start("/metrics", period, scrape("/metrics")),
-        Asker::start("/readyz", period, scrape("/readyz")),
-        Asker::start("token", period, move || {
+        RequestLoop::start("/metrics", period, scrape("/metrics")),
+        RequestLoop::start("/readyz", period, scrape("/readyz")),
+        RequestLoop::start("token", period, move || {
             answer(with_token.api()?, &with_token.request("/health"))
         }),
-        Asker::start("socket", period, move || {
+        RequestLoop::start("socket", period, move || {
             answer(
                 UnixStream::connect(&local.socket)?,
                 "GET /health HTTP/1.1\r\nHost: rp",
@@ -443,15 +458,20 @@ fn askers(doors: &Doors) -> Vec<Asker> {
 }
 
 /// Sends a request on the Unix socket, and returns the status and the answer.
-fn on_the_socket(doors: &Doors, method: &str, path: &str, body: &str) -> Result<(u16, Value)> {
+fn socket_request(
+    doors: &AgentAddresses,
+    method: &str,
+    path: &str,
+    body: &str,
+) -> Result<(u16, Value)> {
     let stream = UnixStream::connect(&doors.socket)?;
     stream.set_read_timeout(Some(Duration::from_secs(20)))?;
     ask(&mut { stream }, method, path, body)
 }
 
 /// Binds the socket that receives the storm.
-fn sink(host: &Namespace) -> Result<UdpSocket> {
-    let address = (host.address(), NOBODY);
+fn storm_receiver(host: &Namespace) -> Result<UdpSocket> {
+    let address = (host.address(), UNUSED_PORT);
     Ok(netns::within(&host.network(), || {
         UdpSocket::bind(address)
     })??)

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use anyhow::{Context as _, Result, ensure};
-use ros2probe_capture::breakpoints::Means;
+use ros2probe_capture::breakpoints::AttachMethod;
 use ros2probe_testing::harness::agent::{Agent, Scrape};
 use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::harness::process::Process;
@@ -44,7 +44,7 @@ os.waitpid(child, 0)
 
 #[test]
 fn libraries_and_processes_with_equal_identities_are_distinguished() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let program = TracedProgram::build(248, &[])?;
     let (built, library) = (program.program(), program.library());
@@ -147,7 +147,7 @@ fn started(host: &Namespace, programs: &[TracedProgram; 2], mode: u32) -> Result
 
 #[test]
 fn without_root_a_library_is_attached_by_its_path_unless_it_was_replaced() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let programs = [
         TracedProgram::build(248, &[])?,
@@ -159,9 +159,9 @@ fn without_root_a_library_is_attached_by_its_path_unless_it_was_replaced() -> Re
     std::os::unix::fs::symlink(programs[0].library(), &gone)?;
 
     let configuration = configured(&host, directory.path())?;
-    let capabilities = match Means::of_this_kernel() {
-        Means::Links => "-all,+net_admin,+bpf,+perfmon,+sys_ptrace",
-        Means::PerfEvents => "-all,+net_admin,+bpf,+perfmon,+sys_ptrace,+sys_admin",
+    let capabilities = match AttachMethod::of_this_kernel() {
+        AttachMethod::Links => "-all,+net_admin,+bpf,+perfmon,+sys_ptrace",
+        AttachMethod::PerfEvents => "-all,+net_admin,+bpf,+perfmon,+sys_ptrace,+sys_admin",
     };
     let start = start_as(UNPRIVILEGED, capabilities, &directory)?;
     let agent = Agent::start(&host, start, &configuration)?;
@@ -188,7 +188,7 @@ fn without_root_a_library_is_attached_by_its_path_unless_it_was_replaced() -> Re
 #[test]
 fn the_packaged_broker_attaches_libraries_of_private_directories_also_replaced_ones() -> Result<()>
 {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let programs = [
         TracedProgram::build(248, &[])?,
@@ -200,7 +200,7 @@ fn the_packaged_broker_attaches_libraries_of_private_directories_also_replaced_o
     let configuration = configured(&host, directory.path())?;
     let mut capabilities = "-all,+net_admin,+bpf,+perfmon,+sys_ptrace".to_owned();
     capabilities += ",+checkpoint_restore,+dac_read_search";
-    if matches!(Means::of_this_kernel(), Means::PerfEvents) {
+    if matches!(AttachMethod::of_this_kernel(), AttachMethod::PerfEvents) {
         capabilities += ",+sys_admin";
     }
     let start = start_as(UNPRIVILEGED, &capabilities, &directory)?;

@@ -8,7 +8,7 @@ use anyhow::{Context as _, Result, ensure};
 use serde_json::Value;
 
 use super::disk::{readable, writes};
-use super::{Counted, Scene};
+use super::{Counted, FaultBench};
 use ros2probe_testing::harness::agent::ON_THE_WIRE;
 use ros2probe_testing::harness::failing_disk::{Failing, FailingDisk};
 use ros2probe_testing::harness::network::Link;
@@ -16,11 +16,11 @@ use ros2probe_testing::harness::soak::outcome;
 use ros2probe_testing::harness::wait_until;
 
 /// Maximum time of an answer, and until a recording ends.
-const PROMPT: Duration = Duration::from_secs(10);
+const MAX_RESPONSE_TIME: Duration = Duration::from_secs(10);
 const EIO: &str = "Input/output error";
 
 struct Robot<'a, 'b> {
-    scene: &'a Scene<'b>,
+    scene: &'a FaultBench<'b>,
     disk: &'a FailingDisk,
     place: &'a Path,
 }
@@ -45,7 +45,9 @@ impl Robot<'_, '_> {
         let (status, problem) = self.scene.ask("POST", "/recordings", &body)?;
         let detail = problem["detail"].as_str().unwrap_or_default();
         ensure!(
-            (500..600).contains(&status) && detail.contains(EIO) && began.elapsed() < PROMPT,
+            (500..600).contains(&status)
+                && detail.contains(EIO)
+                && began.elapsed() < MAX_RESPONSE_TIME,
             "{status} {problem} after {:?}",
             began.elapsed()
         );
@@ -77,7 +79,7 @@ impl Robot<'_, '_> {
 
     /// Checks that the bag of a failed recording has the counted messages, both as it is and after
     /// it was completed.
-    fn has_kept(&self, name: &str, messages: u64) -> Result<()> {
+    fn check_failed_bag(&self, name: &str, messages: u64) -> Result<()> {
         ensure!(messages >= 100, "{name}: {messages} messages");
         let bag = self.place.join("bags").join(name);
         let bytes = fs::read(bag.join(format!("{name}_0.mcap")))?;
@@ -92,13 +94,13 @@ impl Robot<'_, '_> {
     /// Checks that everything is written again: the state with this node, and a recording.
     fn recovers(&self, counted: &mut Counted, node: &str, name: &str) -> Result<()> {
         let written = self.writes("written")?;
-        self.disk.fail(Failing::NOTHING);
+        self.disk.fail(Failing::NO_OPERATION);
         wait_until("a state write", || Ok(self.writes("written")? > written))?;
         let text = fs::read_to_string(self.place.join("state/discovery.json"))?;
         serde_json::from_str::<Value>(&text).context("half a state")?;
         ensure!(text.contains(node), "{text}");
         self.record(name)?;
-        counted.talk(320, 40)?;
+        counted.send_samples(320, 40)?;
         let (status, ended) = self
             .scene
             .ask("DELETE", &format!("/recordings/{name}"), "")?;
@@ -111,7 +113,7 @@ impl Robot<'_, '_> {
 }
 
 #[test]
-fn a_disk_that_fails_with_eio_costs_only_the_files_on_it_and_no_message() -> Result<()> {
+fn an_eio_disk_loses_only_its_files_and_no_message() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let place = directory.path().join("disk");
@@ -125,7 +127,7 @@ fn a_disk_that_fails_with_eio_costs_only_the_files_on_it_and_no_message() -> Res
          reserve_bytes: 0\n{ON_THE_WIRE}",
         place.display()
     );
-    let scene = Scene::start(&link.robot, &directory, &configuration, &[])?;
+    let scene = FaultBench::start(&link.robot, &directory, &configuration, &[])?;
     let robot = Robot {
         scene: &scene,
         disk: &disk,
@@ -143,16 +145,16 @@ fn a_disk_that_fails_with_eio_costs_only_the_files_on_it_and_no_message() -> Res
     ] {
         let failed = robot.writes("failed")?;
         robot.record(name)?;
-        counted.talk(1400, 200)?;
+        counted.send_samples(1400, 200)?;
         robot.is_on_the_disk(name)?;
         disk.fail(failing);
         let began = Instant::now();
-        counted.talk(1400, 400)?;
+        counted.send_samples(1400, 400)?;
         let node = format!("node_of_{name}");
         others.push(Counted::start(&link, number, &node)?);
         let (error, kept) = robot.ended(name)?;
         let took = began.elapsed();
-        ensure!(took < PROMPT, "{name}: ended after {took:?}");
+        ensure!(took < MAX_RESPONSE_TIME, "{name}: ended after {took:?}");
         // A failed sync is noticed only when the file is synced.
         if failing != Failing::SYNCS {
             robot.refuses(&format!("{name}_refused"))?;
@@ -163,7 +165,7 @@ fn a_disk_that_fails_with_eio_costs_only_the_files_on_it_and_no_message() -> Res
         scene.node_is_known(&format!("/{node}"))?;
         counted.check(&scene.agent)?;
         robot.recovers(&mut counted, &node, &format!("{name}_recovered"))?;
-        robot.has_kept(name, kept)?;
+        robot.check_failed_bag(name, kept)?;
         outcome(
             &format!("EIO for {name}"),
             &format!(
@@ -175,17 +177,17 @@ fn a_disk_that_fails_with_eio_costs_only_the_files_on_it_and_no_message() -> Res
     // A recording reads nothing from the disk.
     robot.record("reads")?;
     disk.fail(Failing::READS);
-    counted.talk(1400, 100)?;
+    counted.send_samples(1400, 100)?;
     let (status, ended) = scene.ask("DELETE", "/recordings/reads", "")?;
     ensure!(
         status == 200 && ended["report"]["messages"] == 100,
         "{status} {ended}"
     );
-    disk.fail(Failing::NOTHING);
+    disk.fail(Failing::NO_OPERATION);
     readable(&place.join("bags/reads"), 100)?;
     counted.check(&scene.agent)?;
     robot.record("last")?;
-    counted.talk(1400, 200)?;
+    counted.send_samples(1400, 200)?;
     robot.is_on_the_disk("last")?;
     disk.fail(Failing::ALL);
     let log = scene.log();

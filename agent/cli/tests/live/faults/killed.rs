@@ -13,7 +13,7 @@ use anyhow::{Context as _, Result, anyhow, ensure};
 use ros2probe_capture::netns;
 use serde_json::Value;
 
-use super::{Counted, PATIENCE, Scene, ask, launch};
+use super::{Counted, FaultBench, PATIENCE, ask, launch};
 use ros2probe_testing::forged::storm::Dice;
 use ros2probe_testing::forged::{Carrier as _, Sender, Talker};
 use ros2probe_testing::harness::agent::Agent;
@@ -80,14 +80,14 @@ impl Robot {
         let thread = std::thread::spawn(move || {
             let mut round = 0;
             while !stopped.load(Ordering::Relaxed) {
-                counted.talk(320, 20)?;
+                counted.send_samples(320, 20)?;
                 if round % 20 == 0 {
                     // Only SPDP is repeated, because endpoints are announced once.
-                    sender.carry(&counted.talker.participant())?;
+                    sender.send(&counted.talker.participant())?;
                     // A new node gives the agent something to save each time.
                     let passer_by = Talker::new(1000 + round % 400, "/passing");
                     for message in passer_by.introduction("passer_by") {
-                        sender.carry(&message)?;
+                        sender.send(&message)?;
                     }
                 }
                 round += 1;
@@ -147,7 +147,7 @@ impl Places {
 }
 
 #[test]
-fn an_agent_killed_at_any_moment_leaves_nothing_and_starts_clean() -> Result<()> {
+fn an_agent_killed_at_any_moment_restarts_without_leftovers() -> Result<()> {
     let seed = std::env::var(SEED).ok().and_then(|text| text.parse().ok());
     let random = || {
         std::time::UNIX_EPOCH
@@ -163,7 +163,7 @@ fn an_agent_killed_at_any_moment_leaves_nothing_and_starts_clean() -> Result<()>
     let configuration = places.configuration_text(&link);
     // The first agent saves the robot's names, and measures a start.
     let began = Instant::now();
-    let scene = Scene::start(&link.robot, &directory, &configuration, &[])?;
+    let scene = FaultBench::start(&link.robot, &directory, &configuration, &[])?;
     let start = began.elapsed();
     let robot = Robot::start(&link)?;
     scene.node_is_known("/robot")?;
@@ -201,7 +201,7 @@ fn an_agent_killed_at_any_moment_leaves_nothing_and_starts_clean() -> Result<()>
     }
 
     // The last agent starts with the names, and ends on request.
-    let scene = Scene::start(&link.robot, &directory, &configuration, &[])?;
+    let scene = FaultBench::start(&link.robot, &directory, &configuration, &[])?;
     scene.node_is_known("/robot")?;
     let broken = places.bags_without_metadata();
     scene.end()?;

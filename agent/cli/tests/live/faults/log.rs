@@ -6,7 +6,7 @@ use std::process::Command;
 
 use anyhow::{Result, ensure};
 
-use super::{Counted, Scene};
+use super::{Counted, FaultBench};
 use ros2probe_testing::harness::agent::ON_THE_WIRE;
 use ros2probe_testing::harness::network::Link;
 use ros2probe_testing::harness::soak::outcome;
@@ -17,9 +17,10 @@ fn a_log_without_a_reader_delays_no_thread() -> Result<()> {
     let directory = tempfile::tempdir()?;
     let right = format!("watch: [/**]\n{ON_THE_WIRE}");
     let (mut reader, writer) = io::pipe()?;
-    let scene = Scene::start_saying(&link.robot, &directory, &right, &[], writer.into())?;
+    let scene =
+        FaultBench::start_until_output(&link.robot, &directory, &right, &[], writer.into())?;
     let mut counted = Counted::start(&link, 1, "talker")?;
-    counted.talk(320, 100)?;
+    counted.send_samples(320, 100)?;
 
     // A loop that reloads a wrong configuration: each reload logs many lines.
     let mistakes: String = (0..200).map(|key| format!("mistake_{key}: 1\n")).collect();
@@ -28,7 +29,7 @@ fn a_log_without_a_reader_delays_no_thread() -> Result<()> {
     let lost = "ros2probe_log_lines_lost_total";
     for _ in 0..20 {
         scene.agent.process.signal("HUP")?;
-        counted.talk(320, 20)?;
+        counted.send_samples(320, 20)?;
     }
     let page = scene
         .agent
@@ -36,7 +37,7 @@ fn a_log_without_a_reader_delays_no_thread() -> Result<()> {
     let missed = page.sum(lost, &[]);
     let state = "ros2probe_config_last_reload_successful";
     ensure!(page.sum(state, &[]) == 0.0, "the mistakes were not seen");
-    counted.talk(320, 100)?;
+    counted.send_samples(320, 100)?;
     counted.check(&scene.agent)?;
 
     std::fs::write(&file, &right)?;

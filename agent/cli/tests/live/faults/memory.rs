@@ -6,8 +6,8 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Result, ensure};
 
-use super::unit::{Allowance, Confined, mebibytes};
-use super::{API_PORT, Counted, PATIENCE, Scene};
+use super::unit::{Allowance, UnitCgroups, mebibytes};
+use super::{API_PORT, Counted, FaultBench, PATIENCE};
 use ros2probe_testing::forged::storm::{Storm, forgery};
 use ros2probe_testing::forged::{Carrier, Sender};
 use ros2probe_testing::harness::agent::ON_THE_WIRE;
@@ -15,10 +15,10 @@ use ros2probe_testing::harness::network::Link;
 use ros2probe_testing::harness::soak::{long, outcome};
 
 /// A port without a socket on the robot.
-pub(super) const NOBODY: u16 = 7399;
+pub(super) const UNUSED_PORT: u16 = 7399;
 
 /// A sender that pauses, so that other tests get a share of the machine.
-pub(super) struct Breathing {
+pub(super) struct PausingSender {
     sender: Sender,
     carried: u32,
     /// Number of messages between two pauses.
@@ -26,17 +26,17 @@ pub(super) struct Breathing {
     rest: Duration,
 }
 
-impl Breathing {
+impl PausingSender {
     /// Sends `pace` messages per millisecond.
-    pub(super) fn start(link: &Link, pace: u32) -> Result<Breathing> {
-        Breathing::resting(link, pace, Duration::from_millis(1))
+    pub(super) fn start(link: &Link, pace: u32) -> Result<PausingSender> {
+        PausingSender::with_pauses(link, pace, Duration::from_millis(1))
     }
 
     /// Sends `pace` messages between two pauses.
-    pub(super) fn resting(link: &Link, pace: u32, rest: Duration) -> Result<Breathing> {
+    pub(super) fn with_pauses(link: &Link, pace: u32, rest: Duration) -> Result<PausingSender> {
         let source = format!("{}:0", link.monitor.address());
-        let target = format!("{}:{NOBODY}", link.robot.address());
-        Ok(Breathing {
+        let target = format!("{}:{UNUSED_PORT}", link.robot.address());
+        Ok(PausingSender {
             sender: Sender::new(&link.monitor, &source, &target)?,
             carried: 0,
             pace,
@@ -45,20 +45,20 @@ impl Breathing {
     }
 }
 
-impl Carrier for Breathing {
-    fn carry(&mut self, payload: &[u8]) -> Result<()> {
+impl Carrier for PausingSender {
+    fn send(&mut self, payload: &[u8]) -> Result<()> {
         self.carried += 1;
         if self.carried.is_multiple_of(self.pace) {
             std::thread::sleep(self.rest);
         }
-        self.sender.carry(payload)
+        self.sender.send(payload)
     }
 }
 
 #[test]
 fn all_caps_reached_together_stay_within_the_memory_of_the_unit() -> Result<()> {
     let limit = Allowance::of_the_unit()?.memory;
-    let group = Confined::to_memory(limit)?;
+    let group = UnitCgroups::to_memory(limit)?;
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let place = directory.path().display();
@@ -70,10 +70,10 @@ fn all_caps_reached_together_stay_within_the_memory_of_the_unit() -> Result<()> 
     );
     let enter = group.enter();
     let words = ["sh", "-c", &enter];
-    let scene = Scene::start(&link.robot, &directory, &configuration, &words)?;
+    let scene = FaultBench::start(&link.robot, &directory, &configuration, &words)?;
     let idle = group.needed()?;
     let mut real = Counted::start(&link, 900_000, "real")?;
-    real.talk(320, 50)?;
+    real.send_samples(320, 50)?;
     let span = Duration::from_secs(if long().is_some() { 120 } else { 8 });
     let (sent, peak) = storm(&scene, &group, &link, span, 0.9)?;
     ensure!(peak < limit, "{peak} bytes with what sockets take");
@@ -82,7 +82,7 @@ fn all_caps_reached_together_stay_within_the_memory_of_the_unit() -> Result<()> 
     // The saved state does not exhaust the memory of the next agent, neither at its start nor
     // later.
     let state = fs::metadata(directory.path().join("state/discovery.json"))?.len();
-    let scene = Scene::start(&link.robot, &directory, &configuration, &words)?;
+    let scene = FaultBench::start(&link.robot, &directory, &configuration, &words)?;
     let restarted = group.needed()?;
     let (more, again) = storm(&scene, &group, &link, span / 2, 0.0)?;
     ensure!(again < limit, "{again} bytes with what sockets take");
@@ -109,8 +109,8 @@ fn all_caps_reached_together_stay_within_the_memory_of_the_unit() -> Result<()> 
 /// Sends all messages concurrently, for at least this time and until this part of the tables is
 /// used. Returns the number of datagrams sent and the maximum memory needed.
 fn storm(
-    scene: &Scene<'_>,
-    group: &Confined,
+    scene: &FaultBench<'_>,
+    group: &UnitCgroups,
     link: &Link,
     span: Duration,
     filled: f64,
@@ -130,14 +130,18 @@ fn storm(
         ensure!(status == 201, "{status} {begun}");
     }
     let storms = [
-        Storm::of_a_crowd(Breathing::start(link, 64)?, 1200, 12),
-        Storm::start(Breathing::start(link, 8)?, forgery),
-        Storm::of_large_samples(Breathing::start(link, 4)?)?,
+        Storm::of_a_crowd(PausingSender::start(link, 64)?, 1200, 12),
+        Storm::start(PausingSender::start(link, 8)?, forgery),
+        Storm::of_large_samples(PausingSender::start(link, 4)?)?,
     ];
     let began = Instant::now();
     let (mut peak, mut is_full) = (0, false);
     while began.elapsed() < span || !is_full {
-        ensure!(group.kills()? == 0, "killed after {:?}", began.elapsed());
+        ensure!(
+            group.oom_kills()? == 0,
+            "killed after {:?}",
+            began.elapsed()
+        );
         peak = peak.max(group.needed()?);
         // A page of all entries needs memory, too.
         let page = scene.agent.scrape()?;
@@ -156,6 +160,6 @@ fn storm(
     for storm in storms {
         sent += storm.end()?;
     }
-    ensure!(group.kills()? == 0, "killed at the end");
+    ensure!(group.oom_kills()? == 0, "killed at the end");
     Ok((sent, peak))
 }

@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use anyhow::{Result, anyhow, ensure};
 
-use super::{API_PORT, Counted, METRICS_PORT, Scene};
+use super::{API_PORT, Counted, FaultBench, METRICS_PORT};
 use ros2probe_capture::netns;
 use ros2probe_testing::harness::agent::ON_THE_WIRE;
 use ros2probe_testing::harness::network::{Link, Namespace};
@@ -80,7 +80,7 @@ impl Receiver {
 }
 
 #[test]
-fn misbehaving_receivers_and_scrapers_are_counted_and_cost_no_message() -> Result<()> {
+fn misbehaving_receivers_and_scrapers_are_counted_and_lose_no_message() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let hanging = Receiver::start(&link.robot, None)?;
@@ -98,7 +98,7 @@ fn misbehaving_receivers_and_scrapers_are_counted_and_cost_no_message() -> Resul
     ];
     let mut words = vec!["env"];
     words.extend(variables.iter().map(String::as_str));
-    let scene = Scene::start(&link.robot, &directory, &configuration, &words)?;
+    let scene = FaultBench::start(&link.robot, &directory, &configuration, &words)?;
     let mut counted = Counted::start(&link, 1, "talker")?;
     scene.node_is_known("/talker")?;
     let before = Usage::of(scene.pid())?;
@@ -107,7 +107,7 @@ fn misbehaving_receivers_and_scrapers_are_counted_and_cost_no_message() -> Resul
     let rounds = if long().is_some() { 600 } else { 6 };
     let mut most = 0;
     for _ in 0..rounds {
-        counted.talk(320, 200)?;
+        counted.send_samples(320, 200)?;
         most = most.max(Usage::of(scene.pid())?.memory.unreclaimable);
     }
     counted.check(&scene.agent)?;
@@ -127,9 +127,9 @@ fn misbehaving_receivers_and_scrapers_are_counted_and_cost_no_message() -> Resul
     })?;
     let delivered = page.sum("ros2probe_otlp_exports_total", &[("outcome", "delivered")]);
     ensure!(delivered == 0.0, "{delivered} were taken by nobody");
-    let said = scene.log();
-    let lines = said.matches("refuses the export").count();
-    ensure!((2..=3).contains(&lines), "{said}");
+    let printed = scene.log();
+    let lines = printed.matches("refuses the export").count();
+    ensure!((2..=3).contains(&lines), "{printed}");
     let took = scene.end()?;
     drop(slow);
     let connections = (hanging.end()?, babbling.end()?);
@@ -147,11 +147,11 @@ fn misbehaving_receivers_and_scrapers_are_counted_and_cost_no_message() -> Resul
 }
 
 #[test]
-fn a_crowd_of_scrapers_and_clients_is_bounded_and_leaves_nothing_behind() -> Result<()> {
+fn many_scrapers_and_clients_are_bounded_and_leave_no_descriptor_open() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let configuration = format!("watch: [/**]\n{ON_THE_WIRE}");
-    let scene = Scene::start(&link.robot, &directory, &configuration, &[])?;
+    let scene = FaultBench::start(&link.robot, &directory, &configuration, &[])?;
     let mut counted = Counted::start(&link, 1, "talker")?;
     scene.node_is_known("/talker")?;
     let before = Usage::of(scene.pid())?;
@@ -170,7 +170,7 @@ fn a_crowd_of_scrapers_and_clients_is_bounded_and_leaves_nothing_behind() -> Res
             crowd.push(stream);
         }
     }
-    counted.talk(320, 500)?;
+    counted.send_samples(320, 500)?;
     let (most, after) = (open()?, Usage::of(scene.pid())?);
     ensure!(
         most <= descriptors + PLACES,
@@ -188,10 +188,10 @@ fn a_crowd_of_scrapers_and_clients_is_bounded_and_leaves_nothing_behind() -> Res
         .args([env!("CARGO_BIN_EXE_rp"), "run", "--config"])
         .arg(directory.path().join("ros2probe.yaml"))
         .output()?;
-    let said = String::from_utf8_lossy(&second.stderr);
+    let printed = String::from_utf8_lossy(&second.stderr);
     ensure!(
-        second.status.code() == Some(1) && said.contains("cannot listen on 127.0.0.1:17400"),
-        "{:?} {said}",
+        second.status.code() == Some(1) && printed.contains("cannot listen on 127.0.0.1:17400"),
+        "{:?} {printed}",
         second.status
     );
 
@@ -219,7 +219,7 @@ fn a_crowd_of_scrapers_and_clients_is_bounded_and_leaves_nothing_behind() -> Res
 }
 
 /// Opens slow connections of every kind.
-fn scrapers(scene: &Scene<'_>) -> Result<Vec<TcpStream>> {
+fn scrapers(scene: &FaultBench<'_>) -> Result<Vec<TcpStream>> {
     let mut all = Vec::new();
     for number in 0..SLOW {
         for port in [METRICS_PORT, API_PORT] {

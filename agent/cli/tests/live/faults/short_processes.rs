@@ -8,8 +8,8 @@ use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::soak::{long, outcome};
 use ros2probe_testing::harness::traced_program::TracedProgram;
 
-use super::Scene;
-use super::unit::{Allowance, Confined, mebibytes};
+use super::FaultBench;
+use super::unit::{Allowance, UnitCgroups, mebibytes};
 
 const PATIENCE: Duration = Duration::from_secs(60);
 /// Number of shells that start one process after the other.
@@ -23,11 +23,11 @@ const LOOP: &str = r#"i=0; while [ $i -lt $1 ]; do
 done"#;
 
 #[test]
-fn thousands_of_short_processes_cost_bounded_memory_and_no_message_of_others() -> Result<()> {
+fn thousands_of_short_processes_use_bounded_memory_and_lose_no_message_of_others() -> Result<()> {
     let all: u32 = if long().is_some() { 20_000 } else { 2_000 };
     let allowance = Allowance::of_the_unit()?;
-    let group = Confined::to(&allowance)?;
-    let host = Namespace::alone()?;
+    let group = UnitCgroups::to(&allowance)?;
+    let host = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let program = TracedProgram::build(248, &[])?;
     let configuration = format!(
@@ -36,7 +36,7 @@ fn thousands_of_short_processes_cost_bounded_memory_and_no_message_of_others() -
     );
     let enter = group.enter();
     let words = ["sh", "-c", &enter];
-    let scene = Scene::start(&host, &directory, &configuration, &words)?;
+    let scene = FaultBench::start(&host, &directory, &configuration, &words)?;
     let arguments = ["/in", "/real", "real"];
     let mut real = Process::start(&host.inside(), program.program(), arguments)?;
     scene
@@ -71,7 +71,7 @@ fn thousands_of_short_processes_cost_bounded_memory_and_no_message_of_others() -
         most = most.max(scene.agent.scrape()?.sum("ros2probe_inside_processes", &[]));
         std::thread::sleep(Duration::from_millis(20));
     }
-    ensure!(group.kills()? == 0, "killed");
+    ensure!(group.oom_kills()? == 0, "killed");
     ensure!(peak < allowance.memory, "{peak} bytes");
     let took = began.elapsed();
     let label = [("topic", "/real")];

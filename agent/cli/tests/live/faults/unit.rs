@@ -38,24 +38,24 @@ impl Allowance {
 }
 
 /// Control groups of a test: one of version 2, or one per controller of version 1.
-pub(super) struct Confined {
+pub(super) struct UnitCgroups {
     memory: PathBuf,
     cpu: Option<PathBuf>,
     is_second: bool,
 }
 
-impl Confined {
+impl UnitCgroups {
     /// Limits memory to this many bytes, without swap.
-    pub(super) fn to_memory(limit: u64) -> Result<Confined> {
-        Confined::create("memory", limit, None)
+    pub(super) fn to_memory(limit: u64) -> Result<UnitCgroups> {
+        UnitCgroups::create("memory", limit, None)
     }
 
     /// Limits memory and CPU time to those that the unit allows.
-    pub(super) fn to(allowance: &Allowance) -> Result<Confined> {
-        Confined::create("unit", allowance.memory, Some(allowance.cpu_percent))
+    pub(super) fn to(allowance: &Allowance) -> Result<UnitCgroups> {
+        UnitCgroups::create("unit", allowance.memory, Some(allowance.cpu_percent))
     }
 
-    fn create(name: &str, memory: u64, cpu_percent: Option<u64>) -> Result<Confined> {
+    fn create(name: &str, memory: u64, cpu_percent: Option<u64>) -> Result<UnitCgroups> {
         static CREATED: AtomicU32 = AtomicU32::new(0);
         let number = CREATED.fetch_add(1, Ordering::Relaxed);
         let name = format!("r2p-{}-{name}-{number}", std::process::id());
@@ -66,7 +66,7 @@ impl Confined {
             Ok(path)
         };
         if let Some(first) = mount("cgroup", "memory")? {
-            let mut group = Confined {
+            let mut group = UnitCgroups {
                 memory: make(first.join(&name))?,
                 cpu: None,
                 is_second: false,
@@ -97,7 +97,7 @@ impl Confined {
                 .context("controllers cannot be handed down: run as root on the host")?;
         }
         let path = make(second.join(name))?;
-        let group = Confined {
+        let group = UnitCgroups {
             cpu: quota.map(|_| path.clone()),
             memory: path,
             is_second: true,
@@ -130,7 +130,7 @@ impl Confined {
         Ok(used.saturating_sub(value(&self.memory, "memory.stat", "cache")?))
     }
 
-    pub(super) fn kills(&self) -> Result<u64> {
+    pub(super) fn oom_kills(&self) -> Result<u64> {
         match self.is_second {
             true => value(&self.memory, "memory.events", "oom_kill"),
             false => value(&self.memory, "memory.oom_control", "oom_kill"),
@@ -153,7 +153,7 @@ impl Confined {
     }
 }
 
-impl Drop for Confined {
+impl Drop for UnitCgroups {
     fn drop(&mut self) {
         let deadline = Instant::now() + Duration::from_secs(5);
         for path in self.groups() {

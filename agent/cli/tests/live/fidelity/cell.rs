@@ -16,9 +16,9 @@ pub(crate) struct Cell {
     /// Samples that the agent reports as lost, with the reported cause.
     pub(crate) reported: BTreeMap<u64, LossCause>,
     /// Causes that the trouble may have.
-    pub(crate) possible: BTreeSet<LossCause>,
+    pub(crate) possible_causes: BTreeSet<LossCause>,
     /// Whether the trouble is certain to drop samples.
-    pub(crate) must_lose: bool,
+    pub(crate) drops_samples: bool,
 }
 
 impl Cell {
@@ -58,14 +58,13 @@ impl Cell {
         );
         fault("not lost", named.difference(&self.lost).copied().collect());
         for cause in LossCause::ALL {
-            let wrong = self
-                .reported
-                .iter()
-                .filter(|(_, reported)| **reported == cause && !self.possible.contains(&cause));
+            let wrong = self.reported.iter().filter(|(_, reported)| {
+                **reported == cause && !self.possible_causes.contains(&cause)
+            });
             let wrong = wrong.map(|(number, _)| *number).collect();
             fault(&format!("cannot be of {}", cause.label()), wrong);
         }
-        if self.must_lose && self.lost.is_empty() {
+        if self.drops_samples && self.lost.is_empty() {
             faults.push(format!("{}: lost nothing", self.name));
         }
         faults

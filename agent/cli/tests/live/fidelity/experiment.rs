@@ -30,17 +30,17 @@ const RECORD_RING: u32 = 16 << 20;
 const SETTLED: Duration = Duration::from_secs(60);
 /// Interval of checks for silence. RustDDS sends somewhat later than it logs, and announcements
 /// never cease.
-const QUIET: Duration = Duration::from_millis(400);
+const SILENCE_CHECK_INTERVAL: Duration = Duration::from_millis(400);
 const PAUSE: Duration = Duration::from_millis(20);
 const ANNOUNCEMENTS: u64 = 10;
 /// Maximum number of incomplete datagrams without a report (`docs/limitations.md`).
-const UNREPORTED: u64 = 1;
+const MAX_UNREPORTED: u64 = 1;
 /// The kernel's timeout for IP fragments on the subscribers' host, with a margin.
 const REASSEMBLY: Duration = Duration::from_millis(1500);
 
 /// The fault during one stretch of a stream.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Trouble {
+pub(crate) enum InjectedFault {
     Nothing,
     /// This percentage of the samples loses a datagram.
     Datagrams(u64),
@@ -64,12 +64,12 @@ pub(crate) struct Experiment {
     pub(crate) stack: Stack,
     pub(crate) size: Size,
     pub(crate) subscribers: usize,
-    pub(crate) troubles: Vec<Trouble>,
+    pub(crate) troubles: Vec<InjectedFault>,
 }
 
 /// One stretch with its fault, as it was observed.
 struct Span {
-    trouble: Trouble,
+    trouble: InjectedFault,
     overflown: bool,
 }
 
@@ -129,21 +129,21 @@ impl Size {
     }
 }
 
-impl Trouble {
+impl InjectedFault {
     /// Returns whether the fault affects this one of so many subscribers.
-    fn strikes(self, subscriber: usize, subscribers: usize) -> bool {
+    fn affects(self, subscriber: usize, subscribers: usize) -> bool {
         match self {
-            Trouble::Nothing => false,
-            Trouble::Datagrams(_) | Trouble::Fragments(_) => true,
-            Trouble::DatagramsToTheLast(_) => subscriber + 1 == subscribers,
-            Trouble::Stops => subscriber == 0,
+            InjectedFault::Nothing => false,
+            InjectedFault::Datagrams(_) | InjectedFault::Fragments(_) => true,
+            InjectedFault::DatagramsToTheLast(_) => subscriber + 1 == subscribers,
+            InjectedFault::Stops => subscriber == 0,
         }
     }
 
     const fn cause(self) -> LossCause {
         match self {
-            Trouble::Fragments(_) => LossCause::Reassembly,
-            Trouble::Stops => LossCause::SocketBuffer,
+            InjectedFault::Fragments(_) => LossCause::Reassembly,
+            InjectedFault::Stops => LossCause::SocketBuffer,
             _ => LossCause::BeforeHost,
         }
     }
@@ -186,7 +186,7 @@ impl Experiment {
             "not all was sent"
         );
         // The sums settle while the peers run, and the lists once the peers have ended.
-        let doubts = sums_that_differ(&mut witness, &sent, &received)?;
+        let doubts = differing_sums(&mut witness, &sent, &received)?;
         let seen = witness.latest().context("no snapshot")?;
         let topic = self.size.stream().topic;
         let page = agent.as_ref().map(|agent| agent.settled_scrape(&topic, 0));
@@ -203,23 +203,23 @@ impl Experiment {
         for (subscriber, truth) in received.iter().enumerate() {
             let losses = reported(&testimony.delivery_losses, &seen, &sent.guid, &truth.guid)?;
             if let Some(page) = &page {
-                truth.ensure_on(page, &losses)?;
+                truth.check_page(page, &losses)?;
             }
             let missing = truth.missing(&sent.numbers);
             for (span, due) in spans.iter().zip(1..) {
                 let mut cell = self.cell(subscriber, (span, due), &missing, &losses);
-                if let Trouble::Fragments(_) = span.trouble {
+                if let InjectedFault::Fragments(_) = span.trouble {
                     let reported = cell.losses_by(LossCause::Reassembly);
                     let unreported = incomplete.checked_sub(reported as u64);
                     ensure!(
-                        unreported.is_some_and(|unreported| unreported <= UNREPORTED),
+                        unreported.is_some_and(|unreported| unreported <= MAX_UNREPORTED),
                         "{cell}: the kernel had {incomplete} incomplete datagrams, and counted{}: {:?}",
                         testimony.counted(),
                         testimony.delivery_losses
                     );
                     // A busy machine may drop a first fragment, too: nothing is incomplete then.
                     let is_less = reported < cell.lost.len();
-                    cell.possible
+                    cell.possible_causes
                         .extend(is_less.then_some(LossCause::BeforeHost));
                 }
                 cells.push(cell);
@@ -247,7 +247,7 @@ impl Experiment {
     ) -> Cell {
         let numbers = (due - 1) * self.size.samples() + 1..=due * self.size.samples();
         let trouble = span.trouble;
-        let strikes = trouble.strikes(subscriber, self.subscribers);
+        let strikes = trouble.affects(subscriber, self.subscribers);
         let mut possible = BTreeSet::new();
         possible.extend(strikes.then_some(trouble.cause()));
         possible.extend(span.overflown.then_some(LossCause::SocketBuffer));
@@ -259,8 +259,8 @@ impl Experiment {
             sent: numbers.clone().collect(),
             lost: missing.range(numbers.clone()).copied().collect(),
             reported: losses.range(numbers).map(|(at, why)| (*at, *why)).collect(),
-            possible,
-            must_lose: strikes,
+            possible_causes: possible,
+            drops_samples: strikes,
         }
     }
 
@@ -315,19 +315,25 @@ impl Experiment {
     }
 
     /// Applies one fault while the next stretch is sent, until `due` samples are sent in total.
-    fn span(&self, trouble: Trouble, due: u64, link: &Link, peers: &mut Peers) -> Result<Span> {
+    fn span(
+        &self,
+        trouble: InjectedFault,
+        due: u64,
+        link: &Link,
+        peers: &mut Peers,
+    ) -> Result<Span> {
         let host = peers.host()?;
         let overflows = || Snmp::of(host)?.receive_buffer_errors();
         let before = overflows()?;
         let _loss = self.loss(trouble, link, peers)?;
-        peers.publisher.go()?;
-        if trouble == Trouble::Stops {
+        peers.publisher.start_sending()?;
+        if trouble == InjectedFault::Stops {
             // A busy publisher may send little while its subscriber is stopped for a short time.
             self.stop(peers, || Ok(overflows()? > before))?;
         }
         while (peers.publisher.log()?.sequences("pub").len() as u64) < due {
             match trouble {
-                Trouble::Stops => self.stop(peers, || Ok(true))?,
+                InjectedFault::Stops => self.stop(peers, || Ok(true))?,
                 _ => std::thread::sleep(PAUSE),
             }
         }
@@ -355,16 +361,16 @@ impl Experiment {
 
     fn loss<'a>(
         &self,
-        trouble: Trouble,
+        trouble: InjectedFault,
         link: &'a Link,
         peers: &Peers,
     ) -> Result<Option<Loss<'a>>> {
         let (per_cent, part, to) = match trouble {
-            Trouble::Nothing | Trouble::Stops => return Ok(None),
-            Trouble::Datagrams(per_cent) => (per_cent, Part::Whole, None),
-            Trouble::Fragments(per_cent) => (per_cent, Part::Trailing, None),
-            Trouble::DatagramsToTheLast(per_cent) => {
-                (per_cent, Part::Whole, Some(peers.ports_of_the_last()?))
+            InjectedFault::Nothing | InjectedFault::Stops => return Ok(None),
+            InjectedFault::Datagrams(per_cent) => (per_cent, Part::Whole, None),
+            InjectedFault::Fragments(per_cent) => (per_cent, Part::Trailing, None),
+            InjectedFault::DatagramsToTheLast(per_cent) => {
+                (per_cent, Part::Whole, Some(peers.last_ports()?))
             }
         };
         let length = match self.size {
@@ -387,11 +393,7 @@ impl Experiment {
 /// Waits until the agent has counted what each subscriber logged, and returns where the counts
 /// differ. A loss after the last received sample may be open until the writer ends, because a
 /// stopped subscriber may miss the last sample.
-fn sums_that_differ(
-    witness: &mut Witness,
-    sent: &Truth,
-    received: &[Truth],
-) -> Result<Vec<String>> {
+fn differing_sums(witness: &mut Witness, sent: &Truth, received: &[Truth]) -> Result<Vec<String>> {
     let mut doubts = Vec::new();
     for truth in received {
         let missing = truth.missing(&sent.numbers);
@@ -440,7 +442,7 @@ impl Peers {
     }
 
     /// Returns the ports that only the last subscriber has.
-    fn ports_of_the_last(&self) -> Result<Vec<String>> {
+    fn last_ports(&self) -> Result<Vec<String>> {
         let mut sockets = self
             .subscribers
             .iter()
@@ -464,7 +466,7 @@ impl Peers {
         };
         let mut before = state()?;
         loop {
-            std::thread::sleep(QUIET);
+            std::thread::sleep(SILENCE_CHECK_INTERVAL);
             let now = state()?;
             if now.1 == before.1 && now.0 < before.0 + ANNOUNCEMENTS {
                 return Ok(());
@@ -503,18 +505,18 @@ impl Truth {
     }
 
     /// Checks that an agent's page has the same counts for this reader.
-    fn ensure_on(&self, page: &Scrape, losses: &BTreeMap<u64, LossCause>) -> Result<()> {
+    fn check_page(&self, page: &Scrape, losses: &BTreeMap<u64, LossCause>) -> Result<()> {
         let prefix = self.guid.get(..24).context("a short GUID")?;
         let subscriber = format!("participant {prefix}.000001c1");
-        let whose = ("subscriber", subscriber.as_str());
-        let received = page.sum("ros2_subscriber_received_messages_total", &[whose]);
+        let reader_label = ("subscriber", subscriber.as_str());
+        let received = page.sum("ros2_subscriber_received_messages_total", &[reader_label]);
         ensure!(
             received == self.numbers.len() as f64,
             "{received} on the page"
         );
         for cause in LossCause::ALL {
             let name = "ros2_subscriber_lost_messages_total";
-            let lost = page.sum(name, &[whose, ("cause", cause.label())]);
+            let lost = page.sum(name, &[reader_label, ("cause", cause.label())]);
             let reported = losses.values().filter(|each| **each == cause).count();
             ensure!(
                 lost == reported as f64,
@@ -541,13 +543,19 @@ pub(crate) fn sums(seen: &Snapshot, writer: &str, reader: &str) -> Delivered {
     let sockets = sockets_of(seen, reader);
     let mut sums = Delivered::default();
     for delivery in seen.topics.iter().flat_map(|topic| &topic.deliveries) {
-        let of_reader = delivery.readers.iter().any(|guid| is(*guid, reader))
+        let of_reader = delivery
+            .readers
+            .iter()
+            .any(|guid| is_same_cause(*guid, reader))
             || delivery.readers.is_empty()
                 && delivery
                     .sockets
                     .iter()
                     .any(|socket| sockets.contains(socket));
-        if delivery.direction == Direction::Received && of_reader && is(delivery.writer, writer) {
+        if delivery.direction == Direction::Received
+            && of_reader
+            && is_same_cause(delivery.writer, writer)
+        {
             sums.add(&delivery.delivered);
         }
     }
@@ -557,7 +565,8 @@ pub(crate) fn sums(seen: &Snapshot, writer: &str, reader: &str) -> Delivered {
 /// Returns the sockets at which a reader is known to receive.
 fn sockets_of(seen: &Snapshot, reader: &str) -> BTreeSet<u64> {
     let deliveries = seen.topics.iter().flat_map(|topic| &topic.deliveries);
-    let of_reader = deliveries.filter(|each| each.readers.iter().any(|guid| is(*guid, reader)));
+    let of_reader =
+        deliveries.filter(|each| each.readers.iter().any(|guid| is_same_cause(*guid, reader)));
     of_reader.flat_map(|each| each.sockets.clone()).collect()
 }
 
@@ -577,7 +586,7 @@ pub(crate) fn reported(
     let mut reported = BTreeMap::new();
     for loss in losses {
         let socket = sockets.contains(&loss.socket);
-        if loss.participant.map_or(socket, is_prefix) && is(loss.writer, writer) {
+        if loss.participant.map_or(socket, is_prefix) && is_same_cause(loss.writer, writer) {
             for number in loss.first.0..=loss.last.0 {
                 let before = reported.insert(number, loss.cause);
                 ensure!(before.is_none(), "{number} was lost twice: {loss:?}");
@@ -588,6 +597,6 @@ pub(crate) fn reported(
 }
 
 /// Compares a GUID with one of a log, which has no point.
-pub(crate) fn is(guid: Guid, logged: &str) -> bool {
+pub(crate) fn is_same_cause(guid: Guid, logged: &str) -> bool {
     guid.to_string().replace('.', "") == logged
 }

@@ -8,7 +8,7 @@ use anyhow::{Context as _, Result, ensure};
 use ros2probe_model::facts::loss::LossCause;
 use ros2probe_model::report::snapshot::{AcknowledgementFacts, Delivered, Snapshot};
 
-use super::experiment::{DISCOVERY, Truth, is, reported, sums};
+use super::experiment::{DISCOVERY, Truth, is_same_cause, reported, sums};
 use ros2probe_testing::harness::loss::{Loss, Part};
 use ros2probe_testing::harness::network::Link;
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
@@ -16,10 +16,10 @@ use ros2probe_testing::harness::witness::Witness;
 
 const PATIENCE: Duration = Duration::from_secs(60);
 /// Number of first samples, some of which are dropped, in a stream of seven seconds.
-const WOUNDED: u64 = 100;
+const LOSSY_SAMPLES: u64 = 100;
 const SAMPLES: u64 = 220;
 /// One of this many datagrams with samples is dropped.
-const NTH: u64 = 5;
+const LOSS_PERIOD: u64 = 5;
 
 /// Counts of the agent on the receiving host.
 pub(crate) struct Repair {
@@ -45,8 +45,8 @@ impl Repair {
         // The rule also matches repaired samples, alone or several in one datagram. A HEARTBEAT is
         // shorter.
         let samples = format!("udp length 380-65535 udp dport != {{ {DISCOVERY} }}");
-        let loss = Loss::of_datagrams(&link.robot, &samples, NTH, Part::Whole)?;
-        wait_until(|| Ok(publisher.log()?.sequences("pub").len() as u64 >= WOUNDED))?;
+        let loss = Loss::of_datagrams(&link.robot, &samples, LOSS_PERIOD, Part::Whole)?;
+        wait_until(|| Ok(publisher.log()?.sequences("pub").len() as u64 >= LOSSY_SAMPLES))?;
         let dropped = loss.counts()?.dropped;
         drop(loss);
         // Fast DDS repeats its request within three seconds. A reader delivers samples in order, so
@@ -165,7 +165,7 @@ fn delivered_pair(link: &Link, stack: Stack, witness: &mut Witness) -> Result<(P
         (known == (1, 1)).then_some(())
     })?;
 
-    publisher.go()?;
+    publisher.start_sending()?;
     // RustDDS sends to a multicast address, so the agent learns only later which socket receives
     // it.
     witness.wait_for("the socket that receives samples", PATIENCE, |seen| {
@@ -179,7 +179,7 @@ fn delivered_pair(link: &Link, stack: Stack, witness: &mut Witness) -> Result<(P
 fn acknowledgement(seen: &Snapshot, writer: &str, reader: &str) -> Option<AcknowledgementFacts> {
     let mut facts = seen.topics.iter().flat_map(|topic| &topic.acknowledgements);
     facts
-        .find(|each| is(each.writer, writer) && is(each.reader, reader))
+        .find(|each| is_same_cause(each.writer, writer) && is_same_cause(each.reader, reader))
         .cloned()
 }
 

@@ -48,7 +48,7 @@ impl Round {
             early.iter_mut().try_for_each(Shape::wait_matched)?;
         }
         for (publisher, ..) in &mut begun {
-            publisher.go()?;
+            publisher.start_sending()?;
         }
         for (publisher, early, _) in &mut begun {
             wait_until("the history", || Ok(sent(publisher)? == COUNT))?;
@@ -80,7 +80,7 @@ impl Round {
             wait_received(&scene.late, &scene.publisher, kept)?;
         }
         for (_, scene) in &mut scenes {
-            scene.publisher.go()?;
+            scene.publisher.start_sending()?;
         }
         for (_, scene) in &mut scenes {
             scene.publisher.wait_sent()?;

@@ -54,14 +54,14 @@ impl Round {
             peers.into_iter().try_for_each(Shape::wait_matched)?;
         }
         for scene in scenes.iter_mut() {
-            scene.publishers[0].go()?;
+            scene.publishers[0].start_sending()?;
         }
         for scene in scenes.iter_mut() {
             for subscriber in &scene.subscribers {
                 let begins = || Ok(!samples(subscriber)?.is_empty());
                 wait_until(&format!("{}: first samples", scene.name()), begins)?;
             }
-            scene.publishers[1].go()?;
+            scene.publishers[1].start_sending()?;
         }
         for scene in scenes.iter_mut() {
             scene.publishers.iter_mut().try_for_each(Shape::wait_sent)?;

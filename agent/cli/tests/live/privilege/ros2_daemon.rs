@@ -10,7 +10,7 @@ const LIST: &str = "<methodCall><methodName>system.listMethods</methodName></met
 
 #[test]
 fn without_any_privilege_the_thread_takes_over_the_port_and_answers() -> Result<()> {
-    let host = Namespace::alone()?;
+    let host = Namespace::isolated()?;
     let network = host.network();
     // A real daemon has the port first.
     let other = netns::within(&network, || TcpListener::bind(ADDRESS))??;

@@ -183,7 +183,7 @@ pub(super) fn settled(
 pub(super) fn is_exact(page: &Scrape) -> bool {
     let lost = page.sum("ros2probe_records_dropped_total", &[]);
     if lost > 0.0 {
-        eprintln!("too busy to be exact: {}", page.doubts());
+        eprintln!("too busy to be exact: {}", page.doubted_jumps());
     }
     lost == 0.0
 }

@@ -11,7 +11,7 @@ fn payloads_in_shared_memory_equal_those_that_were_sent() -> Result<()> {
     let (mut publisher, _subscriber) = host.pair(&stream)?;
     let client = observed.client()?;
     let mut lines = open(&client, "topic=/points&payload=true", "/points")?;
-    publisher.go()?;
+    publisher.start_sending()?;
     let (whole, missed) = given(&mut lines, &stream)?;
     ensure!((whole, missed) == (40, 0), "{whole} {missed}");
     Ok(())
@@ -30,7 +30,7 @@ fn samples_above_64_kib_are_read_from_shared_memory_by_polling() -> Result<()> {
     let (mut publisher, _subscriber) = host.known_pair(&observed, &stream)?;
     let client = observed.client()?;
     let mut lines = open(&client, "topic=/points&payload=true", "/points")?;
-    publisher.go()?;
+    publisher.start_sending()?;
     let (whole, missed) = given(&mut lines, &stream)?;
     println!("{whole} of {} whole, {missed} missed", stream.count);
     // A machine with other load may poll too late.
@@ -65,7 +65,7 @@ fn on_demand_every_sample_is_seen_and_the_last_reader_removes_the_breakpoint() -
     let mut lines = open(&client, "topic=/points&payload=true", "/points")?;
     ensure!(is_attached(&publisher)?, "a sample is to be read");
     observed.wait_for_view("exact")?;
-    publisher.go()?;
+    publisher.start_sending()?;
     let (whole, missed) = given(&mut lines, &stream)?;
     ensure!((whole, missed) == (stream.count, 0), "{whole} {missed}");
     drop(lines);
@@ -88,7 +88,7 @@ fn while_breakpoints_attach_samples_keep_their_order_and_losses_are_reported() -
         ..in_shared_memory(320, 1500)
     };
     let (mut publisher, _subscriber) = host.known_pair(&observed, &stream)?;
-    publisher.go()?;
+    publisher.start_sending()?;
     std::thread::sleep(Duration::from_secs(1));
     let client = observed.client()?;
     let mut lines = open(&client, "topic=/points&payload=true", "/points")?;
@@ -140,7 +140,7 @@ struct Host {
 
 impl Host {
     fn new() -> Result<Self> {
-        let network = Namespace::alone()?;
+        let network = Namespace::isolated()?;
         let shared_memory = SharedMemory::of(&network, 64)?;
         Ok(Self {
             enter: shared_memory.inside(&network),

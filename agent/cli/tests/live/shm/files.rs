@@ -3,11 +3,11 @@
 use super::*;
 
 /// Number of attempts after which the surviving peer is replaced, too.
-const DEAF: u32 = 3;
+const MAX_ATTEMPTS_PER_PEER: u32 = 3;
 
 #[test]
-fn idle_garbage_truncated_and_foreign_files_do_no_harm() -> Result<()> {
-    let network = Namespace::alone()?;
+fn idle_malformed_truncated_and_foreign_files_are_ignored() -> Result<()> {
+    let network = Namespace::isolated()?;
     let host = Host::new(&network)?;
     let directory = tempfile::tempdir()?;
     let agent = start_agent(&network, directory.path())?;
@@ -19,7 +19,7 @@ fn idle_garbage_truncated_and_foreign_files_do_no_harm() -> Result<()> {
     let memory = host.shared_memory();
     let (ports, segments) = files_of(&memory)?;
     write_idle_and_broken_files(&memory, &ports[0])?;
-    publisher.go()?;
+    publisher.start_sending()?;
     let open = |page: &Scrape| page.sum("ros2probe_shm_open", &[("kind", "port")]);
     let idle = agent.scrape_until("128 more ports", |page| open(page) >= 130.0)?;
     let began = messages(&idle);
@@ -108,10 +108,10 @@ fn replaced_and_removed_files_are_closed(
 
 /// Tries several pairs: the killed participants stay in the graph until their leases end.
 fn a_new_pair_is_counted(host: &Host<'_>, agent: &Agent<'_>, stream: &Stream) -> Result<()> {
-    for attempt in 1..=MEETINGS {
+    for attempt in 1..=MAX_START_ATTEMPTS {
         let (mut publisher, _subscriber) = host.pair(stream)?;
         let before = messages(&agent.scrape()?);
-        publisher.go()?;
+        publisher.start_sending()?;
         let deadline = Instant::now() + Duration::from_secs(5);
         while Instant::now() < deadline {
             if messages(&agent.scrape()?) > before + 200.0 {
@@ -126,7 +126,7 @@ fn a_new_pair_is_counted(host: &Host<'_>, agent: &Agent<'_>, stream: &Stream) ->
 
 #[test]
 fn after_a_kill_of_either_peer_counts_recover_and_no_file_stays_open() -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let host = Host::new(&network)?;
     let directory = tempfile::tempdir()?;
     let agent = start_agent(&network, directory.path())?;
@@ -135,7 +135,7 @@ fn after_a_kill_of_either_peer_counts_recover_and_no_file_stays_open() -> Result
         ..shared()
     };
     let (mut publisher, mut subscriber) = host.known_pair(&agent, &stream)?;
-    publisher.go()?;
+    publisher.start_sending()?;
     let flows = || -> Result<bool> {
         let sum = |page: Scrape| page.sum("ros2_topic_messages_total", &[("topic", "/imu")]);
         let before = sum(agent.scrape()?);
@@ -158,7 +158,7 @@ fn after_a_kill_of_either_peer_counts_recover_and_no_file_stays_open() -> Result
                 (Role::Subscriber, &mut subscriber),
                 (Role::Publisher, &mut publisher),
             ] {
-                if each != role && attempt <= DEAF {
+                if each != role && attempt <= MAX_ATTEMPTS_PER_PEER {
                     continue;
                 }
                 peer.process.signal("KILL")?;
@@ -166,14 +166,14 @@ fn after_a_kill_of_either_peer_counts_recover_and_no_file_stays_open() -> Result
                 *peer = host.launch(each, &stream)?;
                 peer.wait_ready()?;
                 if each == Role::Publisher {
-                    peer.go()?;
+                    peer.start_sending()?;
                 }
             }
             std::thread::sleep(Duration::from_secs(2));
             most = most.max(host.files_open_in(&agent)?.len());
             Ok(flows()? || flows()?)
         };
-        let mut attempts = 1..=MEETINGS;
+        let mut attempts = 1..=MAX_START_ATTEMPTS;
         loop {
             let Some(attempt) = attempts.next() else {
                 let page = agent.scrape()?;
@@ -203,7 +203,7 @@ fn after_a_kill_of_either_peer_counts_recover_and_no_file_stays_open() -> Result
 /// counts none of these messages.
 #[test]
 fn files_of_killed_processes_lead_to_no_node_and_no_unknown_writer() -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let host = Host::new(&network)?;
     let stream = Stream {
         count: 400,
@@ -211,7 +211,7 @@ fn files_of_killed_processes_lead_to_no_node_and_no_unknown_writer() -> Result<(
         ..shared()
     };
     let (mut publisher, mut subscriber) = host.pair(&stream)?;
-    publisher.go()?;
+    publisher.start_sending()?;
     publisher.wait_sent(PATIENCE)?;
     for peer in [&mut publisher, &mut subscriber] {
         peer.process.signal("KILL")?;
@@ -235,7 +235,7 @@ fn files_of_killed_processes_lead_to_no_node_and_no_unknown_writer() -> Result<(
 
 #[test]
 fn files_below_dev_shm_are_opened_only_for_reading_and_never_mapped() -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let host = Host::new(&network)?;
     let directory = tempfile::tempdir()?;
     let agent = start_agent(&network, directory.path())?;

@@ -26,7 +26,7 @@ const RELIABLE: [&str; 2] = ["0", "RELIABLE"];
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp, ros2bag, rosbag2_storage_mcap: make test-ros2"]
 fn a_bag_has_each_message_byte_for_byte_and_ros2_plays_it() -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
     let agent = host.agent("watch: []\n")?;
     let _router = host.router("")?;
@@ -54,8 +54,8 @@ fn a_bag_has_each_message_byte_for_byte_and_ros2_plays_it() -> Result<()> {
     std::thread::sleep(Duration::from_secs(1));
     recorder.signal("INT")?;
     let status = recorder.wait(PATIENCE)?;
-    let said = fs::read_to_string(host.file("recorder.err"))?;
-    ensure!(status.code() == Some(0), "{said}");
+    let printed = fs::read_to_string(host.file("recorder.err"))?;
+    ensure!(status.code() == Some(0), "{printed}");
     drop((publishers, subscriptions));
 
     let recorded = hashes(&host, &bag)?;
@@ -124,10 +124,10 @@ fn record(host: &Host<'_>, bag: &str) -> Result<Process> {
     enter.push(format!("ROS_DISTRO={}", installed::distro()));
     let recorder = Process::start_with(&enter, RP, words, File::create(&errors)?.into())?;
     wait_until("it records both topics", || {
-        let said = fs::read_to_string(&errors)?;
+        let printed = fs::read_to_string(&errors)?;
         let is_subscribed =
-            |(_, topic, ..): &(_, &str, _, _, _)| said.contains(&format!("'{topic}'"));
-        Ok(said.contains("Recording...") && STREAMS.iter().all(is_subscribed))
+            |(_, topic, ..): &(_, &str, _, _, _)| printed.contains(&format!("'{topic}'"));
+        Ok(printed.contains("Recording...") && STREAMS.iter().all(is_subscribed))
     })?;
     Ok(recorder)
 }

@@ -67,7 +67,7 @@ impl Robot {
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
 fn connections_over_tls_are_reported_and_their_messages_counted_inside() -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
     let agent = host.agent_inside(WATCH)?;
     let mut robot = Robot::start(&host, "tls")?;
@@ -86,9 +86,9 @@ fn connections_over_tls_are_reported_and_their_messages_counted_inside() -> Resu
     let counted = (counted("published_messages"), counted("taken_messages"));
     ensure!(counted == (5000.0, log.received as f64), "{counted:?}");
     ensure!(page.sum("ros2_topic_messages_total", &TOPIC) == 5000.0);
-    let said = host.rp(&["doctor", "--json"])?;
+    let printed = host.rp(&["doctor", "--json"])?;
     let sentence = "2 connections of Zenoh encrypted with TLS cannot be read; messages are";
-    ensure!(said.contains(sentence), "{said}");
+    ensure!(printed.contains(sentence), "{printed}");
     drop(robot);
     agent.scrape_until("the connections have ended", |page| {
         page.sum(UNSEEN, &[]) == 0.0
@@ -99,7 +99,7 @@ fn connections_over_tls_are_reported_and_their_messages_counted_inside() -> Resu
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
 fn connections_over_quic_are_reported() -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
     let agent = host.agent(WATCH)?;
     let mut robot = Robot::start(&host, "quic")?;
@@ -110,7 +110,7 @@ fn connections_over_quic_are_reported() -> Result<()> {
         page.sum(UNSEEN, &[("reason", "quic")]) == 1.0
     })?;
     ensure!(page.sum("ros2_topic_messages_total", &TOPIC) == 0.0);
-    let said = host.rp(&["doctor", "--json"])?;
-    ensure!(said.contains("encrypted with QUIC"), "{said}");
+    let printed = host.rp(&["doctor", "--json"])?;
+    ensure!(printed.contains("encrypted with QUIC"), "{printed}");
     Ok(())
 }

@@ -25,8 +25,8 @@ fn robot(host: &Host<'_>) -> Result<[Process; 3]> {
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
-fn an_agent_that_starts_last_counts_and_learns_the_names_from_the_router() -> Result<()> {
-    let network = Namespace::alone()?;
+fn a_late_agent_counts_and_reads_the_names_from_the_router() -> Result<()> {
+    let network = Namespace::isolated()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
     let [_router, mut sensor, mut one] = robot(&host)?;
     publish(&mut sensor, 200, 200)?;
@@ -57,7 +57,7 @@ fn an_agent_that_starts_last_counts_and_learns_the_names_from_the_router() -> Re
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
 fn a_ros2_command_reveals_the_receivers_of_connections_older_than_the_agent() -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
     let [_router, mut sensor, mut one] = robot(&host)?;
     let agent = host.agent(WATCH)?;

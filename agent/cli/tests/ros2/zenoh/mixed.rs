@@ -19,7 +19,7 @@ const RATE: [&str; 4] = ["200", "300", "2000", "BEST_EFFORT"];
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp, rmw_cyclonedds_cpp: make test-ros2"]
 fn nodes_of_dds_and_zenoh_are_in_one_graph_and_counted_separately() -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let zenoh = Host::new(&network, Middleware::Zenoh)?;
     let dds = Host::new(&network, Middleware::Cyclone)?;
     let agent = zenoh.agent(WATCH)?;

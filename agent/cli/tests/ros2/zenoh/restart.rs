@@ -13,7 +13,7 @@ const QOS: [&str; 2] = ["2000", "RELIABLE"];
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
 fn a_restarted_agent_has_the_names_and_counts_of_each_node() -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
     let mut agent = host.agent(WATCH)?;
     let _router = host.router("")?;

@@ -7,7 +7,7 @@ use std::net::TcpStream;
 use anyhow::{Context as _, Result, ensure};
 use ros2probe_capture::netns;
 use ros2probe_testing::harness::network::Namespace;
-use ros2probe_testing::viewer::{News, SUBPROTOCOLS, open};
+use ros2probe_testing::viewer::{SUBPROTOCOLS, ServerMessage, open};
 use sha2::{Digest as _, Sha256};
 
 use crate::counting::{PATIENCE, publisher, subscription};
@@ -21,7 +21,7 @@ const QOS: [&str; 2] = ["0", "RELIABLE"];
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
 fn a_viewer_receives_point_clouds_byte_for_byte() -> Result<()> {
-    let network = Namespace::alone()?;
+    let network = Namespace::isolated()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
     let agent = host.agent("watch: []\n")?;
     let _router = host.router("")?;
@@ -45,8 +45,10 @@ fn a_viewer_receives_point_clouds_byte_for_byte() -> Result<()> {
     let mut hashes = Vec::new();
     while hashes.len() < COUNT {
         match viewer.next_within(PATIENCE)?.context("no message")? {
-            News::Data(data) if data.subscription == id => hashes.push(hash(&data.payload)?),
-            News::Status(status) => anyhow::bail!("{}", status.message),
+            ServerMessage::Data(data) if data.subscription == id => {
+                hashes.push(hash(&data.payload)?);
+            }
+            ServerMessage::Status(status) => anyhow::bail!("{}", status.message),
             _ => {}
         }
     }

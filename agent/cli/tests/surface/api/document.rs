@@ -402,7 +402,7 @@ fn no_request_gets_an_undocumented_answer() {
         .current_dir(directory.path())
         .output()
         .unwrap();
-    let said = String::from_utf8_lossy(&output.stdout);
-    assert!(output.status.success(), "{said}\n{}", agent.log());
+    let printed = String::from_utf8_lossy(&output.stdout);
+    assert!(output.status.success(), "{printed}\n{}", agent.log());
     assert_eq!(ask(&agent, "GET", "/health", "", "").status, 200);
 }

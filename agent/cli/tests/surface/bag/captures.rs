@@ -213,11 +213,11 @@ fn only_chosen_topics_are_converted_and_an_existing_directory_is_refused() {
     let before = fs::read(bag.join("metadata.yaml")).unwrap();
     let output = convert(&capture, &bag, &["-a"]);
     let stderr = String::from_utf8(output.stderr).unwrap();
-    let said = format!(
+    let printed = format!(
         "[ERROR] [ros2bag]: Output folder '{}' already exists.\n",
         bag.display()
     );
-    assert_eq!((output.status.code(), stderr), (Some(1), said));
+    assert_eq!((output.status.code(), stderr), (Some(1), printed));
     assert_eq!(fs::read(bag.join("metadata.yaml")).unwrap(), before);
     let by_pattern = directory.path().join("pattern");
     let options = [

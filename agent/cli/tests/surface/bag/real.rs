@@ -64,10 +64,10 @@ fn info_of_every_real_bag_equals_that_of_ros2_bag_info() {
     assert_eq!(bags.len(), 7);
     for bag in bags {
         let name = bag.file_name().unwrap().to_str().unwrap();
-        let said = fs::read_to_string(real().join(name).join("info.txt")).unwrap();
+        let output_text = fs::read_to_string(real().join(name).join("info.txt")).unwrap();
         let printed = rp(&["bag", "info", bag.to_str().unwrap(), "--distro", "humble"]);
         let printed = String::from_utf8(printed.stdout).unwrap();
-        assert_eq!(printed.repeat(2), said, "{name}");
+        assert_eq!(printed.repeat(2), output_text, "{name}");
     }
 }
 

@@ -89,10 +89,10 @@ fn text(bytes: &[u8]) -> String {
 /// Asserts that the command fails with one line that has these words.
 fn fails(script: Vec<Then>, words: &[&str]) {
     let (output, _) = Server::start(script).ask(&[]);
-    says(&output, words);
+    assert_output_contains(&output, words);
 }
 
-fn says(output: &Output, words: &[&str]) {
+fn assert_output_contains(output: &Output, words: &[&str]) {
     let errors = text(&output.stderr);
     assert_eq!(output.status.code(), Some(1), "{errors}");
     assert_eq!(errors.lines().count(), 1, "{errors}");
@@ -164,7 +164,7 @@ fn a_dry_run_prints_the_messages_and_does_not_connect() {
 
 #[test]
 fn a_closed_port_is_reported_as_no_router() {
-    says(
+    assert_output_contains(
         &ask(free_address(), &[]),
         &[
             "no Zenoh router at 127.0.0.1:",
@@ -226,11 +226,11 @@ fn an_end_at_each_step_is_reported_with_the_last_message() {
 fn a_silent_router_leads_to_a_timeout_and_to_a_goodbye_in_an_open_session() {
     let silent = Server::start(vec![Then::Wait]);
     let (output, received) = silent.ask(&[]);
-    says(&output, &["no answer", "introduction (INIT)", "within 3 s"]);
+    assert_output_contains(&output, &["no answer", "introduction (INIT)", "within 3 s"]);
     assert_eq!(received.len(), 24, "{received:x?}");
     let stops = Server::start(vec![introduced(), Then::Batches(vec![open()]), Then::Wait]);
     let (output, received) = stops.ask(&[]);
-    says(&output, &["no answer", "request (INTEREST)", "within 3 s"]);
+    assert_output_contains(&output, &["no answer", "request (INTEREST)", "within 3 s"]);
     assert!(received.ends_with(&[2, 0, 0x23, 0]), "{received:x?}");
 }
 
@@ -254,7 +254,7 @@ fn an_endless_answer_ends_at_the_cap_with_a_part_of_the_graph() {
     answer.push(frame(&final_()));
     let script = vec![introduced(), Then::Batches(answer), Then::Wait];
     let (output, received) = Server::start(script).ask(&[]);
-    says(&output, &["announces more than rp takes", "--domain"]);
+    assert_output_contains(&output, &["announces more than rp takes", "--domain"]);
     let printed = text(&output.stdout);
     assert!(
         printed.contains("learned 0 nodes, 65536 publishers"),

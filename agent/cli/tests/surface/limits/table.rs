@@ -18,7 +18,7 @@ fn every_limit_of_the_configuration_is_on_the_metrics_page_and_in_health() {
     }
     let agent = agent(directory.path(), &caps);
     let page = agent.get("/metrics").body;
-    let (status, health) = ask(agent.api, "GET", "/health", "");
+    let (status, health) = call_api(agent.api, "GET", "/health", "");
     assert_eq!(status, 200);
     let shown = health["limits"].as_array().unwrap();
     for (limit, shown) in Limit::ALL.into_iter().zip(shown) {

@@ -41,7 +41,7 @@ pub fn events() -> String {
     for Definition {
         name,
         severity,
-        relief,
+        resolved_severity: relief,
         attributes,
         help,
         ..

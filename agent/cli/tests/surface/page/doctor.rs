@@ -4,7 +4,7 @@ use super::*;
 use ros2probe_api::doctor::{Area, Report};
 
 #[test]
-fn the_doctor_of_a_replay_examines_the_capture_alone() {
+fn the_doctor_of_a_replay_examines_only_the_capture() {
     let agent = ended("cyclonedds/qos-mismatch-2ns", &[]);
     let report = get(&agent, "/doctor");
     let report: Report = serde_json::from_value(report).unwrap();

@@ -147,10 +147,10 @@ fn all_files_of_a_bag_can_be_downloaded() {
         ],
     );
     agent.wait_for_log("ready");
-    let (status, begun) = ask(agent.api, "POST", "/recordings", r#"{"name": "one"}"#);
+    let (status, begun) = call_api(agent.api, "POST", "/recordings", r#"{"name": "one"}"#);
     assert_eq!(status, 201, "{begun}");
     std::thread::sleep(Duration::from_millis(500));
-    assert_eq!(ask(agent.api, "DELETE", "/recordings/one", "").0, 200);
+    assert_eq!(call_api(agent.api, "DELETE", "/recordings/one", "").0, 200);
     let files = get(&agent, "/recordings/one/files");
     let files = rows(&files["files"]);
     assert!(files.len() >= 2, "{files:?}");

@@ -3,7 +3,7 @@
 use super::*;
 
 #[test]
-fn a_replay_keeps_no_history_on_disk_and_says_so() {
+fn a_replay_keeps_no_history_on_disk_and_reports_the_reason() {
     let agent = ended("cyclonedds/points-besteffort-lossy-2ns", &[]);
     let about = get(&agent, "/history");
     assert_eq!(

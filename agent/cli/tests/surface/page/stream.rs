@@ -55,7 +55,7 @@ fn a_stream_begins_with_the_whole_state_and_continues_with_changes() {
         "{began:?}"
     );
     // A watch changes the structure, but not the figures.
-    assert_eq!(ask(agent.api, "POST", "/watch/another", "").0, 201);
+    assert_eq!(call_api(agent.api, "POST", "/watch/another", "").0, 201);
     let batch = live.batch();
     assert!(
         line(&batch, "agent")["watches"].as_u64().unwrap() == 2,

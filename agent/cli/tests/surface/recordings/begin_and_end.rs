@@ -18,7 +18,7 @@ fn a_recording_of_many_topics_begins_and_ends_without_a_request_for_each_topic()
     recording.signal("-INT");
     let (status, ended) = recording.end();
     eprintln!("{MANY} topics: began after {began:?}, ended after {ended:?}");
-    assert_eq!(status.code(), Some(0), "{:#?}", recording.said);
+    assert_eq!(status.code(), Some(0), "{:#?}", recording.printed);
     assert!(began < Duration::from_secs(3), "began after {began:?}");
     // The end waits up to two seconds for messages in transit, because the clock of a replay
     // differs from the current time.
@@ -41,12 +41,12 @@ fn a_recording_that_is_interrupted_at_its_start_leaves_no_bag() {
     let asked = listener.accept().unwrap();
     recording.signal("-INT");
     let (status, ended) = recording.end();
-    assert_eq!(status.code(), Some(2), "{:#?}", recording.said);
+    assert_eq!(status.code(), Some(2), "{:#?}", recording.printed);
     assert!(ended < Duration::from_secs(5), "{ended:?}");
     assert!(
-        recording.said[0].contains("no bag was created"),
+        recording.printed[0].contains("no bag was created"),
         "{:?}",
-        recording.said
+        recording.printed
     );
     assert!(!bag.exists());
     drop(asked);
@@ -67,14 +67,14 @@ fn a_second_interrupt_ends_a_recording_without_waiting_but_with_its_report() {
     recording.wait_for("Completing the bag");
     recording.signal("-INT");
     let (status, ended) = recording.end();
-    assert_eq!(status.code(), Some(0), "{:#?}", recording.said);
+    assert_eq!(status.code(), Some(0), "{:#?}", recording.printed);
     assert!(ended < Duration::from_millis(1500), "{ended:?}");
     let count: usize = messages(&bag).values().map(Vec::len).sum();
     assert!(count > 0);
     let report = format!("{count} messages in {}", bag.display());
     assert!(
-        recording.said.iter().any(|line| line.ends_with(&report)),
+        recording.printed.iter().any(|line| line.ends_with(&report)),
         "{:#?}",
-        recording.said
+        recording.printed
     );
 }

@@ -41,39 +41,39 @@ fn missing_messages_of_a_late_capture_are_counted_and_change_the_exit_code() {
     let capture = directory.path().join("late.pcap");
     with_omissions(&capture);
     let bag = directory.path().join("bag");
-    let (code, said, report) = converted(&capture, &bag, &[]);
+    let (code, printed, report) = converted(&capture, &bag, &[]);
     let topics = &report["topics"];
-    assert_eq!(topics["/whole"]["messages"], 11, "{said}");
-    assert_eq!(topics["/late"]["messages"], 5, "{said}");
-    assert_eq!(topics["/late"]["unannounced"], 10, "{said}");
+    assert_eq!(topics["/whole"]["messages"], 11, "{printed}");
+    assert_eq!(topics["/late"]["messages"], 5, "{printed}");
+    assert_eq!(topics["/late"]["unannounced"], 10, "{printed}");
     assert_eq!(report["missing"], 10, "{report:#}");
     let unknown = serde_json::json!({"writers": 1, "messages": 10});
     assert_eq!(report["unknown_writers"], unknown);
     let unobserved = serde_json::json!({"/inside": "same_process"});
-    assert_eq!(report["unobserved"], unobserved, "{said}");
+    assert_eq!(report["unobserved"], unobserved, "{printed}");
     let others = serde_json::json!([{"domain_id": 7, "topics": 1, "messages": 4}]);
     assert_eq!(report["other_domains"], others);
-    assert_eq!(code, Some(3), "{said}");
-    let last = said.lines().last().unwrap();
+    assert_eq!(code, Some(3), "{printed}");
+    let last = printed.lines().last().unwrap();
     assert!(
         last.contains("some sent messages are not in the bag"),
-        "{said}"
+        "{printed}"
     );
-    assert!(!said.contains("stdin"), "{said}");
+    assert!(!printed.contains("stdin"), "{printed}");
     for line in [
         "/late: 5 of 15 messages recorded; 10 sent before their writer was announced",
         "/inside: no message recorded; publisher and subscriber share one process",
         "not recorded: 10 messages of 1 unknown writer whose announcement was missed",
         "not recorded: 1 topic of domain 7 with 4 messages (`--domain 7`)",
     ] {
-        assert!(said.contains(line), "`{line}` is not in {said}");
+        assert!(printed.contains(line), "`{line}` is not in {printed}");
     }
 
     let bag = directory.path().join("other");
-    let (code, said, report) = converted(&capture, &bag, &["--domain", "7"]);
-    assert_eq!(report["topics"]["/imu"]["messages"], 4, "{said}");
+    let (code, printed, report) = converted(&capture, &bag, &["--domain", "7"]);
+    assert_eq!(report["topics"]["/imu"]["messages"], 4, "{printed}");
     assert_eq!(report["other_domains"][0]["domain_id"], 0);
-    assert_eq!(code, Some(3), "{said}");
+    assert_eq!(code, Some(3), "{printed}");
 }
 
 #[test]
@@ -81,16 +81,20 @@ fn the_conversion_of_a_complete_capture_ends_with_exit_code_0() {
     let directory = tempfile::tempdir().unwrap();
     let capture = directory.path().join("many.pcap");
     many_topics(&capture);
-    let (code, said, report) = converted(&capture, &directory.path().join("bag"), &[]);
+    let (code, printed, report) = converted(&capture, &directory.path().join("bag"), &[]);
     assert_eq!(
         (code, &report["missing"]),
         (Some(0), &Value::from(0)),
-        "{said}"
+        "{printed}"
     );
     assert_eq!(report["messages"], 59 * MANY);
     assert!(
-        said.lines().last().unwrap().ends_with("Recording stopped"),
-        "{said}"
+        printed
+            .lines()
+            .last()
+            .unwrap()
+            .ends_with("Recording stopped"),
+        "{printed}"
     );
 }
 
@@ -104,10 +108,10 @@ fn a_truncated_capture_is_converted_up_to_the_cut_and_changes_the_exit_code() {
     many_topics(&whole);
     let bytes = std::fs::read(&whole).unwrap();
     std::fs::write(&cut, &bytes[..bytes.len() / 2]).unwrap();
-    let (code, said, report) = converted(&cut, &directory.path().join("bag"), &[]);
-    assert_eq!(code, Some(3), "{said}");
-    assert!(report["messages"].as_u64() > Some(1000), "{said}");
-    assert!(said.contains("cut.pcap is incomplete: "), "{said}");
+    let (code, printed, report) = converted(&cut, &directory.path().join("bag"), &[]);
+    assert_eq!(code, Some(3), "{printed}");
+    assert!(report["messages"].as_u64() > Some(1000), "{printed}");
+    assert!(printed.contains("cut.pcap is incomplete: "), "{printed}");
 }
 
 #[test]
@@ -128,11 +132,11 @@ fn an_unsupported_link_type_is_an_error_and_not_an_empty_graph() {
         &["run", "--report", "--replay", capture],
     ] {
         let output = rp().args(arguments).output().unwrap();
-        let said = String::from_utf8_lossy(&output.stderr).into_owned();
-        assert_eq!(output.status.code(), Some(1), "{arguments:?}: {said}");
+        let printed = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(1), "{arguments:?}: {printed}");
         assert!(
-            said.contains("link type 127 (802.11 with radiotap header)"),
-            "{said}"
+            printed.contains("link type 127 (802.11 with radiotap header)"),
+            "{printed}"
         );
         assert!(output.stdout.is_empty(), "{arguments:?}");
     }
@@ -182,8 +186,8 @@ fn a_silent_topic_is_explained_once_on_stderr() {
             .args(["topic", verb, topic, "--replay"])
             .arg(&capture);
         let output = command.env_remove("ROS_DOMAIN_ID").output().unwrap();
-        let said = String::from_utf8_lossy(&output.stderr).into_owned();
-        assert_eq!(said.matches(why).count(), 1, "{verb} {topic}: {said}");
+        let printed = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(printed.matches(why).count(), 1, "{verb} {topic}: {printed}");
         let out = String::from_utf8(output.stdout).unwrap();
         assert!(!out.contains("subscriber"), "{verb}: {out}");
     }
@@ -212,7 +216,7 @@ fn a_silent_topic_is_explained_once_on_stderr() {
     recording.wait_for("/missing has no known publisher");
     std::thread::sleep(Duration::from_secs(2));
     for verb in running {
-        assert!(verb.lines.try_recv().is_err(), "{:?}", verb.said);
+        assert!(verb.lines.try_recv().is_err(), "{:?}", verb.printed);
     }
 }
 
@@ -230,7 +234,7 @@ fn a_capture_without_announcements_leads_to_a_hint_beside_the_known_topics() {
         capture.participant(START, 0, GuidPrefix(prefix.try_into().unwrap()));
     }
     capture.write(&lonely);
-    for (capture, names, said) in [
+    for (capture, names, printed) in [
         (
             &silent,
             "/alone\n/inside\n",
@@ -248,7 +252,7 @@ fn a_capture_without_announcements_leads_to_a_hint_beside_the_known_topics() {
         let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
         assert_eq!(String::from_utf8_lossy(&output.stdout), names);
         assert_eq!(
-            (stderr.lines().count(), stderr.starts_with(said)),
+            (stderr.lines().count(), stderr.starts_with(printed)),
             (1, true),
             "{stderr}"
         );
@@ -271,14 +275,14 @@ fn a_truncated_capture_is_echoed_up_to_the_cut_with_an_error_about_the_capture()
             .args(["topic", verb, "/topic1", "--replay"])
             .arg(&cut);
         let output = command.env_remove("ROS_DOMAIN_ID").output().unwrap();
-        let said = String::from_utf8_lossy(&output.stderr).into_owned();
-        assert_eq!(output.status.code(), Some(1), "{verb}: {said}");
+        let printed = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(1), "{verb}: {printed}");
         assert_eq!(
-            said.matches("b.pcap is incomplete: ").count(),
+            printed.matches("b.pcap is incomplete: ").count(),
             1,
-            "{verb}: {said}"
+            "{verb}: {printed}"
         );
-        assert!(!said.contains("agent"), "{verb}: {said}");
+        assert!(!printed.contains("agent"), "{verb}: {printed}");
         assert!(!output.stdout.is_empty(), "{verb}");
     }
 }

@@ -36,13 +36,13 @@ fn a_recording_warns_early_and_repeatedly_of_writers_without_a_topic() {
     recording.wait_for("Recording...");
     let first = recording.wait_for(&format!("not recorded: {MISSED}"));
     assert!(first < Duration::from_secs(3), "{first:?}");
-    let line = recording.said.last().unwrap();
+    let line = recording.printed.last().unwrap();
     assert!(line.contains("[WARN]") && line.ends_with(REMEDY), "{line}");
     let again = recording.wait_for("not recorded: 1 writer is active");
     assert!(again > Duration::from_secs(5), "{again:?}");
     recording.signal("-INT");
     let (status, _) = recording.end();
-    assert_eq!(status.code(), Some(0), "{:#?}", recording.said);
+    assert_eq!(status.code(), Some(0), "{:#?}", recording.printed);
 
     // In a recording of known topics, nothing is missing.
     let mut command = rp();
@@ -54,9 +54,9 @@ fn a_recording_warns_early_and_repeatedly_of_writers_without_a_topic() {
     recording.signal("-INT");
     recording.wait_for("Completing the bag");
     assert!(
-        recording.said.iter().all(|line| !line.contains(MISSED)),
+        recording.printed.iter().all(|line| !line.contains(MISSED)),
         "{:#?}",
-        recording.said
+        recording.printed
     );
 }
 
@@ -65,7 +65,7 @@ fn a_recording_warns_early_and_repeatedly_of_writers_without_a_topic() {
 fn the_hint_about_missed_announcements_is_printed_only_without_an_answer() {
     let directory = tempfile::tempdir().unwrap();
     let agent = late_agent(directory.path());
-    let ask = |arguments: &[&str]| {
+    let run_rp = |arguments: &[&str]| {
         let mut command = rp();
         command
             .args(arguments)
@@ -81,9 +81,9 @@ fn the_hint_about_missed_announcements_is_printed_only_without_an_answer() {
         (&["topic", "find", kind], "/whole\n".to_owned()),
         (&["topic", "find", kind, "-c"], "1\n".to_owned()),
     ] {
-        assert_eq!(ask(arguments), (answer, String::new()), "{arguments:?}");
+        assert_eq!(run_rp(arguments), (answer, String::new()), "{arguments:?}");
     }
-    let (info, hint) = ask(&["topic", "info", "/whole"]);
+    let (info, hint) = run_rp(&["topic", "info", "/whole"]);
     assert!(info.contains(kind) && hint.is_empty(), "{info}{hint}");
     let hint = format!("rp: {MISSED}: the agent started after them; {REMEDY}\n");
     for arguments in [
@@ -100,7 +100,7 @@ fn the_hint_about_missed_announcements_is_printed_only_without_an_answer() {
         &["action", "list"],
         &["action", "type", "/other"],
     ] {
-        let (_, stderr) = ask(arguments);
+        let (_, stderr) = run_rp(arguments);
         assert!(stderr.contains(&hint), "{arguments:?}: {stderr}");
         assert_eq!(stderr.matches(MISSED).count(), 1, "{arguments:?}: {stderr}");
     }
@@ -115,6 +115,6 @@ fn the_hint_about_missed_announcements_is_printed_only_without_an_answer() {
 }
 
 fn ask_api(agent: &LocalAgent, path: &str) -> (u16, String) {
-    let (status, answer) = local_agent::ask(agent.api, "GET", path, "");
+    let (status, answer) = local_agent::call_api(agent.api, "GET", path, "");
     (status, answer.to_string())
 }

@@ -63,14 +63,14 @@ fn echo_prints_the_output_of_ros2cli() {
             .filter(|argument| *argument != "--once")
             .collect();
         let output = echo(&arguments, start, end);
-        let said = stdout(&output);
-        let whole = said.split_inclusive('\n').collect::<Vec<_>>();
+        let output_text = stdout(&output);
+        let whole = output_text.split_inclusive('\n').collect::<Vec<_>>();
         let part = recorded.stdout.split_inclusive('\n').collect::<Vec<_>>();
         let is_part = part.is_empty() && whole.is_empty()
             || !part.is_empty() && whole.windows(part.len()).any(|window| window == part);
-        assert!(is_part, "{name}: {said}{}", stderr(&output));
+        assert!(is_part, "{name}: {output_text}{}", stderr(&output));
         if recorded.code == 1 {
-            assert_eq!(said, recorded.stdout, "{name}");
+            assert_eq!(output_text, recorded.stdout, "{name}");
             // The reason for missing messages follows the output of ros2cli.
             let why = |line: &&str| !line.starts_with("rp: no message on ");
             let err = stderr(&output);
@@ -211,8 +211,8 @@ fn action_echo_prints_feedback_and_states_with_every_middleware() {
         let arguments = [&command[..], &[capture.to_str().unwrap()]].concat();
         let output = run(&arguments);
         assert_eq!(stderr(&output), "", "{software}");
-        let said = stdout(&output);
-        let lines: Vec<&str> = said.lines().collect();
+        let output_text = stdout(&output);
+        let lines: Vec<&str> = output_text.lines().collect();
         let of = |part: &str| -> Vec<&str> {
             let pairs = lines.chunks_exact(2);
             pairs
@@ -222,7 +222,7 @@ fn action_echo_prints_feedback_and_states_with_every_middleware() {
         };
         let feedback = of("FEEDBACK_TOPIC");
         let sequences = [",0,1,1", ",0,1,1,2", ",0,1,1,2,3", ",0,1,1,2,3,5"];
-        assert_eq!(feedback.len(), sequences.len(), "{software}: {said}");
+        assert_eq!(feedback.len(), sequences.len(), "{software}: {output_text}");
         for (line, sequence) in feedback.iter().zip(sequences) {
             let goal = line.strip_suffix(sequence).unwrap();
             assert_eq!(goal.split(',').count(), 16, "{line}");
@@ -235,7 +235,7 @@ fn action_echo_prints_feedback_and_states_with_every_middleware() {
         // A definition of the same name is not used if its hash differs from the announced hash.
         if software == "jazzy-cyclonedds" {
             let again = run(&[&arguments[..], &definitions].concat());
-            assert_eq!((stdout(&again), stderr(&again).as_str()), (said, ""));
+            assert_eq!((stdout(&again), stderr(&again).as_str()), (output_text, ""));
         }
     }
 }

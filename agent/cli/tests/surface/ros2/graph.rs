@@ -130,7 +130,7 @@ fn the_nodes_of_an_action_have_their_full_names() {
 }
 
 #[test]
-fn commands_that_humble_lacks_print_the_output_of_jazzy() {
+fn commands_missing_in_humble_print_the_output_of_jazzy() {
     let capture = own().join("graph.pcap.gz");
     let ask = |words: &str| {
         let mut words: Vec<&str> = words.split(' ').collect();
@@ -138,21 +138,21 @@ fn commands_that_humble_lacks_print_the_output_of_jazzy() {
         let output = run(&words);
         (stdout(&output), stderr(&output), output.status.code())
     };
-    let said = |out: &str| (out.to_owned(), String::new(), Some(0));
+    let printed = |out: &str| (out.to_owned(), String::new(), Some(0));
     assert_eq!(
         ask("service info /robot1/add_two_ints"),
-        said("Type: example_interfaces/srv/AddTwoInts\nClients count: 1\nServices count: 1\n")
+        printed("Type: example_interfaces/srv/AddTwoInts\nClients count: 1\nServices count: 1\n")
     );
     let (out, err, code) = ask("service info /robot1/nope");
     assert_eq!((out.as_str(), code), ("", Some(1)));
     assert_eq!(err, "Unknown service '/robot1/nope'\n");
     let fibonacci = "example_interfaces/action/Fibonacci\n";
-    assert_eq!(ask("action type /robot1/fibonacci"), said(fibonacci));
+    assert_eq!(ask("action type /robot1/fibonacci"), printed(fibonacci));
     assert_eq!(
         ask("action type /nope"),
         (String::new(), String::new(), Some(1))
     );
-    let found = said("/robot1/fibonacci\n");
+    let found = printed("/robot1/fibonacci\n");
     assert_eq!(ask(&format!("action find {}", fibonacci.trim())), found);
     // Hidden services are listed with the option of the command, and also with that of the verb.
     let hidden = "/robot1/fibonacci/_action/send_goal";

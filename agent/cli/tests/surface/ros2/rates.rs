@@ -12,7 +12,7 @@ use serde_json::Value;
 use super::{run, stderr, stdout};
 
 /// Time in seconds after which the recorded command of ros2cli was stopped.
-const LASTED: f64 = 7.0;
+const RECORDED_SECONDS: f64 = 7.0;
 
 /// A row of the list of tolerances.
 #[derive(Debug)]
@@ -88,44 +88,47 @@ fn received_messages_of_a_lossy_topic_are_counted() {
         .find(|one| one["topic"] == "/robot1/imu/data")
         .unwrap();
     // 902 of 1000 messages were received, so there are 901 intervals.
-    let said = on(small, "hz /robot1/imu/data --distro kilted");
+    let printed = on(small, "hz /robot1/imu/data --distro kilted");
     let window = imu["count"].as_u64().unwrap() - 1;
-    assert!(said.ends_with(&format!(" window: {window}\n")), "{said}");
+    assert!(
+        printed.ends_with(&format!(" window: {window}\n")),
+        "{printed}"
+    );
     let (rate, truth) = (
-        last(&said, "average rate: "),
+        last(&printed, "average rate: "),
         imu["rate_hz"].as_f64().unwrap(),
     );
     assert!((rate - truth).abs() <= truth / 1000.0, "{rate} of {truth}");
     // Each repair of a reliable topic is counted once. The table also has the other topic.
-    let said = on(small, "hz /chatter robot1/imu/data --distro kilted");
+    let printed = on(small, "hz /chatter robot1/imu/data --distro kilted");
     assert!(
-        said.contains("\n/chatter          ") && said.contains("   249   \n"),
-        "{said}"
+        printed.contains("\n/chatter          ") && printed.contains("   249   \n"),
+        "{printed}"
     );
-    assert!(said.contains("\nrobot1/imu/data   180.19"), "{said}");
-    let said = on(small, "delay /robot1/imu/data");
+    assert!(printed.contains("\nrobot1/imu/data   180.19"), "{printed}");
+    let printed = on(small, "delay /robot1/imu/data");
     assert!(
-        said.contains(&format!("window: {window}\nno new messages\n")),
-        "{said}"
+        printed.contains(&format!("window: {window}\nno new messages\n")),
+        "{printed}"
     );
 
     // 4 of 10 point clouds were complete. The reliable topic has 9 intervals, although fragments
     // were repeated.
     let lossy = "cyclonedds/points-besteffort-lossy-2ns/capture.pcap.gz";
-    let said = on(lossy, "hz /robot1/points --distro kilted");
+    let printed = on(lossy, "hz /robot1/points --distro kilted");
     assert!(
-        said.contains("average rate: 3.77") && said.ends_with("window: 3\n"),
-        "{said}"
+        printed.contains("average rate: 3.77") && printed.ends_with("window: 3\n"),
+        "{printed}"
     );
-    let said = on(lossy, "bw /robot1/points --distro rolling");
+    let printed = on(lossy, "bw /robot1/points --distro rolling");
     let sizes = "Message size mean: 0.64 MB min: 0.64 MB max: 0.64 MB";
     assert!(
-        said.ends_with(&format!("from 4 messages\n\t{sizes}\n")),
-        "{said}"
+        printed.ends_with(&format!("from 4 messages\n\t{sizes}\n")),
+        "{printed}"
     );
     let repeated = "fastrtps-udp/points-reliable-2ns/capture.pcap.gz";
-    let said = on(repeated, "hz /robot1/points --distro kilted");
-    assert!(said.ends_with("window: 9\n"), "{said}");
+    let printed = on(repeated, "hz /robot1/points --distro kilted");
+    assert!(printed.ends_with("window: 9\n"), "{printed}");
 }
 
 #[test]
@@ -143,15 +146,15 @@ fn topics_that_cannot_be_measured_are_refused() {
     assert_eq!(on("hz").0, Some(2));
     let both = "Cannot specify both --all/-a and topic names\n".to_owned();
     assert_eq!(on("hz -a /chatter"), (Some(1), both));
-    let (code, said) = on("delay /a//b");
+    let (code, printed) = on("delay /a//b");
     assert!(
-        code == Some(1) && said.starts_with("Invalid topic name: "),
-        "{said}"
+        code == Some(1) && printed.starts_with("Invalid topic name: "),
+        "{printed}"
     );
-    let (code, said) = on("hz -w 0 /chatter");
+    let (code, printed) = on("hz -w 0 /chatter");
     assert!(
-        code == Some(2) && said.contains("value must be a positive integer"),
-        "{said}"
+        code == Some(2) && printed.contains("value must be a positive integer"),
+        "{printed}"
     );
 }
 
@@ -166,10 +169,10 @@ fn rates_of_the_corpus_agree_with_the_logs_of_the_nodes() {
         let Some(tolerance) = list.get(&recorded.name).filter(|_| is_whole) else {
             continue;
         };
-        let said = recorded.replayed(&corpus.join("capture-with-observers.pcap.gz"), tolerance);
+        let printed = recorded.replayed(&corpus.join("capture-with-observers.pcap.gz"), tolerance);
         let times = &sent[recorded.arguments.last().unwrap()];
         let first = times.partition_point(|time| *time < recorded.start + tolerance.start_up);
-        for block in said.0.split("average rate: ").skip(1) {
+        for block in printed.0.split("average rate: ").skip(1) {
             let rate: f64 = block.split('\n').next().unwrap().parse().unwrap();
             let window: usize = block
                 .trim_end()
@@ -199,15 +202,15 @@ impl Recorded {
         };
         let err: String = err.split_inclusive('\n').filter(why).collect();
         assert_eq!(err, self.err, "{name}");
-        let said = format!("{name} said\n{out}and the original\n{}", self.out);
-        assert_eq!(out.lines().count(), self.out.lines().count(), "{said}");
+        let printed = format!("{name} said\n{out}and the original\n{}", self.out);
+        assert_eq!(out.lines().count(), self.out.lines().count(), "{printed}");
         for (line, original) in out.lines().zip(self.out.lines()) {
             let (line, original) = (words(line), words(original));
-            assert_eq!(line.len(), original.len(), "{said}");
+            assert_eq!(line.len(), original.len(), "{printed}");
             let mut before = "";
             for (word, original) in line.iter().zip(&original) {
-                let same = tolerance.admits(before, word, original);
-                assert!(same, "`{before} {word}` is not `{original}`: {said}");
+                let same = tolerance.is_within(before, word, original);
+                assert!(same, "`{before} {word}` is not `{original}`: {printed}");
                 before = word;
             }
         }
@@ -216,7 +219,7 @@ impl Recorded {
     /// Returns standard output and standard error of the same command on a capture.
     fn replayed(&self, capture: &Path, tolerance: &Tolerance) -> (String, String) {
         let from = format!("{:.9}", self.start + tolerance.start_up);
-        let until = format!("{:.9}", self.start + LASTED);
+        let until = format!("{:.9}", self.start + RECORDED_SECONDS);
         let mut words: Vec<&str> = self.arguments.iter().map(String::as_str).collect();
         words.extend(["--distro", "humble", "--replay", capture.to_str().unwrap()]);
         words.extend(["--from", &from, "--until", &until]);
@@ -226,7 +229,7 @@ impl Recorded {
 }
 
 impl Tolerance {
-    fn admits(&self, before: &str, word: &str, original: &str) -> bool {
+    fn is_within(&self, before: &str, word: &str, original: &str) -> bool {
         let (Some(value), Some(wanted)) = (number(word), number(original)) else {
             return word == original;
         };
@@ -249,8 +252,8 @@ fn number(word: &str) -> Option<f64> {
     word.strip_suffix('s').unwrap_or(word).parse().ok()
 }
 
-fn last(said: &str, words: &str) -> f64 {
-    let mut numbers = said
+fn last(printed: &str, words: &str) -> f64 {
+    let mut numbers = printed
         .lines()
         .rev()
         .filter_map(|line| line.strip_prefix(words)?.parse().ok());

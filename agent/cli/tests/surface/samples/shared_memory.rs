@@ -16,7 +16,7 @@ fn a_sample_in_several_messages_of_shared_memory_is_delivered_complete() {
         robot.receive(Message::from(ALICE).fragment(WRITER, number, start, 1000, &large));
     }
     let expected = [1, 2, 3].map(|number| (ALICE, number, Ok(large.clone())));
-    let given = robot.given();
+    let given = robot.payloads_of();
     let (whole, missed): (Vec<_>, Vec<_>) = given.into_iter().partition(|each| each.2.is_ok());
     // The last fragment of sample 2 was read while another one was missing, so the sample was given
     // up.
@@ -31,7 +31,7 @@ fn a_sample_in_several_messages_of_shared_memory_is_delivered_complete() {
         (ALICE, 4, Ok(payload(24))),
         (ALICE, 5, Err(MissedReason::NotCaptured)),
     ];
-    assert_eq!(robot.given(), expected);
+    assert_eq!(robot.payloads_of(), expected);
 }
 
 #[test]
@@ -46,24 +46,24 @@ fn missing_samples_of_shared_memory_delay_the_clock_and_are_then_reported() {
         look(&mut robot, number);
     }
     let given = |number| (ALICE, number, Ok(small.clone()));
-    assert_eq!(robot.given(), [given(1), given(2), given(5)]);
+    assert_eq!(robot.payloads_of(), [given(1), given(2), given(5)]);
     let sent = robot.at;
     let now = Timestamp(sent + SECOND / 20);
     robot.observer.input(Input::Time(now));
     assert!(robot.observer.dispatched_until(now).0 < sent);
     // One of the missing samples arrives late.
     look(&mut robot, 3);
-    assert_eq!(robot.given(), [given(3)]);
+    assert_eq!(robot.payloads_of(), [given(3)]);
     let now = Timestamp(sent + SECOND);
     robot.observer.input(Input::Time(now));
     assert_eq!(robot.observer.dispatched_until(now), now);
     let not_captured = (ALICE, 4, Err(MissedReason::NotCaptured));
-    assert_eq!(robot.given(), [not_captured]);
+    assert_eq!(robot.payloads_of(), [not_captured]);
     // At the end of a capture, the agent does not wait for missing samples.
     look(&mut robot, 8);
     robot.observer.input(Input::End);
     assert_eq!(
-        robot.given(),
+        robot.payloads_of(),
         [given(8), (ALICE, 6, Err(MissedReason::NotCaptured))]
     );
 }

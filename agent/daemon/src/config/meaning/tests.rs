@@ -9,7 +9,7 @@ fn report(source: &str) -> String {
 }
 
 #[test]
-fn an_empty_file_means_the_defaults() {
+fn an_empty_file_yields_the_defaults() {
     for empty in [
         "",
         "# nothing\n",

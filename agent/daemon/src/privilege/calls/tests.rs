@@ -106,7 +106,7 @@ fn each_thread_can_silence_a_bell_that_woke_it() {
             [(); 2].map(|()| {
                 bell.ring();
                 let rang = is_readable(bell.descriptor());
-                bell.silence();
+                bell.drain();
                 (rang, is_readable(bell.descriptor()))
             })
         });
@@ -191,11 +191,11 @@ fn only_threads_with_connections_create_sockets_of_the_allowed_kinds() {
 #[test]
 fn an_accepted_connection_cannot_be_redirected() {
     for role in [Role::Serve, Role::Ros2Daemon] {
-        cannot_lead_elsewhere(role);
+        check_connections_refused(role);
     }
 }
 
-fn cannot_lead_elsewhere(role: Role) {
+fn check_connections_refused(role: Role) {
     let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let elsewhere = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let _client = std::net::TcpStream::connect(listener.local_addr().unwrap()).unwrap();
@@ -248,7 +248,7 @@ fn cannot_lead_elsewhere(role: Role) {
 }
 
 #[test]
-fn only_threads_that_need_kernel_maps_can_read_them_and_none_can_probe() {
+fn only_threads_that_need_kernel_maps_can_read_them_and_no_thread_can_probe() {
     let lookup = [LOOK_UP_MAP, 0, 0, 0, 0, 0];
     let may = call(libc::SYS_bpf, lookup);
     for role in ROLES {
@@ -385,14 +385,14 @@ fn a_confined_thread_has_no_capability_and_an_unconfined_one_is_refused() {
 #[test]
 fn a_filter_is_below_the_kernel_limit_and_builds_for_both_architectures() {
     for role in ROLES {
-        let calls = Allowed::to(role).unwrap().0.len();
+        let calls = Allowed::for_role(role).unwrap().0.len();
         let length = program(role).unwrap().len();
         eprintln!("{role:?}: {calls} system calls, {length} instructions");
         // The kernel's limit is 4096.
         assert!((100..1200).contains(&length), "{role:?}: {length}");
         for architecture in [TargetArch::x86_64, TargetArch::aarch64] {
             let filter = SeccompFilter::new(
-                Allowed::to(role).unwrap().0,
+                Allowed::for_role(role).unwrap().0,
                 SeccompAction::Errno(1),
                 SeccompAction::Allow,
                 architecture,

@@ -160,7 +160,7 @@ fn a_recording_ends_at_its_maximum_size_and_reports_the_limit() {
     };
     let quota = DiskQuota::new(directory.path(), limits);
     let mut recorder =
-        recorder(&directory.path().join("bag"), FilterOptions::everything()).within(quota);
+        recorder(&directory.path().join("bag"), FilterOptions::everything()).with_quota(quota);
     let refused = (1..).find_map(|number| recorder.take(&sample("/a", number)).err());
     let ended = recorder.finish(refused);
     let limit = ended.report.limit_reached.clone().unwrap();

@@ -45,9 +45,9 @@ impl Recorder<'_> {
     /// domain.
     pub(super) fn note_what_was_not_observed(&mut self, graph: GraphSnapshot) {
         let mut domains: BTreeMap<u32, OtherDomain> = BTreeMap::new();
-        self.report.unobserved = self.unobserved(&graph);
+        self.report.unobserved = self.unobserved_topics(&graph);
         for topic in graph.topics {
-            if topic.domain_id == self.domain_id || !self.takes(&topic) {
+            if topic.domain_id == self.domain_id || !self.is_selected(&topic) {
                 continue;
             }
             let domain = domains.entry(topic.domain_id).or_default();

@@ -345,5 +345,5 @@ fn recorder(
         graph
     });
     let before = GraphSnapshot::default();
-    Ok(Recorder::new(writer, filter, domain_id, before, sources).within(quota))
+    Ok(Recorder::new(writer, filter, domain_id, before, sources).with_quota(quota))
 }

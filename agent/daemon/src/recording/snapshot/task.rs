@@ -79,7 +79,7 @@ impl SnapshotTask {
     }
 
     /// Runs until `stop`, then completes the open bag.
-    pub(super) fn work(
+    pub(super) fn run(
         mut self,
         mut subscription: Subscription,
         clients: &Receiver<Answer>,
@@ -102,7 +102,7 @@ impl SnapshotTask {
             }
             looked = Instant::now();
             self.read_events();
-            self.show();
+            self.publish_figures();
             if let Ok(client) = clients.try_recv() {
                 // If the client no longer waits, the bag exists nevertheless.
                 let _ = client.send(self.write_memory(Cause::Request));
@@ -289,13 +289,13 @@ impl SnapshotTask {
             messages,
             reason,
         });
-        self.show();
+        self.publish_figures();
     }
 
-    pub(super) fn show(&mut self) {
+    pub(super) fn publish_figures(&mut self) {
         self.figures.messages = self.ring.len() as u64;
         self.figures.bytes = self.ring.bytes() as u64;
-        self.figures.crowded_out = self.ring.crowded_out() + self.unnamed;
+        self.figures.evicted = self.ring.evicted() + self.unnamed;
         let figures = &self.recordings.figures;
         figures.snapshot(&self.settings.name, self.figures);
     }

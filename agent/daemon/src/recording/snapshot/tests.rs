@@ -230,7 +230,7 @@ impl Robot {
     }
 
     fn shown(&mut self) -> SnapshotFigures {
-        self.task.show();
+        self.task.publish_figures();
         self.figures.snapshots()[0].1
     }
 
@@ -440,7 +440,7 @@ fn a_new_finding_triggers_the_snapshots_of_its_kind() {
             calls: 3,
             stage: late::Stage::Callback,
             cause: late::Cause::Runnable,
-            by: Some(other_thread::Culprit {
+            by: Some(other_thread::ThreadLabel {
                 name: "chromium".into(),
                 unit: Some("kiosk.service".into()),
             }),

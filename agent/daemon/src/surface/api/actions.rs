@@ -63,7 +63,7 @@ pub(super) fn actions(
 ) -> BTreeMap<(DomainId, String), Vec<&TopicFacts>> {
     let mut actions: BTreeMap<_, Vec<_>> = BTreeMap::new();
     let admitted = snapshot.topics.iter();
-    for topic in admitted.filter(|topic| scope.admits(topic.domain_id)) {
+    for topic in admitted.filter(|topic| scope.includes(topic.domain_id)) {
         if let Some((name, _)) = action(topic)
             && (!name.is_hidden() || scope.shows_hidden())
         {

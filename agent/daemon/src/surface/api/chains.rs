@@ -56,7 +56,7 @@ async fn list(
 ) -> Result<Response, Problem> {
     let only = domain(ends.domain_id, Code::MalformedRequest)?;
     if ends.calls == Some(true) {
-        context.latest.want_calls();
+        context.latest.request_calls();
     }
     let state = context.state().await;
     let snapshot = state.known();

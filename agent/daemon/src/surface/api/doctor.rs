@@ -14,14 +14,14 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::problem::{Code, Problem, ProblemBody};
-use super::security::Granted;
-use super::turns::{NoResult, in_turn};
+use super::security::Rights;
+use super::turns::{NoResult, run_blocking};
 use super::{Context, nouns};
 use ros2probe_api::doctor::Report;
 
 /// Maximum time of an examination. It reads files of all processes.
-const WITHIN: Duration = Duration::from_secs(10);
-static TURN: Semaphore = Semaphore::const_new(1);
+const EXAMINATION_TIMEOUT: Duration = Duration::from_secs(10);
+static EXAMINATION_PERMIT: Semaphore = Semaphore::const_new(1);
 
 /// Examines this host with the agent's own answers.
 #[derive(Clone)]
@@ -77,11 +77,14 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
 )]
 async fn examine(
     State(context): State<Context>,
-    Extension(granted): Extension<Granted>,
+    Extension(granted): Extension<Rights>,
 ) -> Result<Json<Report>, Problem> {
     let doctor = context.doctor.clone();
     let answers = own_answers(&context, granted).await?;
-    let report = in_turn(&TURN, WITHIN, move || (doctor.0)(&answers)).await;
+    let report = run_blocking(&EXAMINATION_PERMIT, EXAMINATION_TIMEOUT, move || {
+        (doctor.0)(&answers)
+    })
+    .await;
     report.map(Json).map_err(|no_result| match no_result {
         NoResult::Late => Problem::new(Code::Ending, "the examination of this host does not end"),
         NoResult::Ending => ending(),
@@ -92,7 +95,7 @@ fn ending() -> Problem {
     Problem::new(Code::Ending, "the agent is shutting down")
 }
 
-async fn own_answers(context: &Context, granted: Granted) -> Result<OwnAnswers, Problem> {
+async fn own_answers(context: &Context, granted: Rights) -> Result<OwnAnswers, Problem> {
     let (router, _) = nouns(Some(context)).split_for_parts();
     let router = router.layer(Extension(granted)).with_state(context.clone());
     let router = &TowerToHyperService::new(router);

@@ -30,7 +30,7 @@ use ros2probe_api::recordings::{RecordingFile, RecordingFiles};
 /// Maximum number of files listed per bag.
 const MAX_FILES: usize = 10_000;
 /// Maximum size of one read, in bytes.
-const PIECE: usize = 64 << 10;
+const READ_BYTES: usize = 64 << 10;
 
 pub(super) fn routes() -> OpenApiRouter<Context> {
     OpenApiRouter::new()
@@ -111,8 +111,8 @@ async fn download(
 
 /// All files of a recording
 ///
-/// The answer is a tar archive with the bag's directory. It has the lengths of the files at the time
-/// of the request; data appended later are not included.
+/// The answer is a tar archive with the bag's directory. It has the lengths of the files at the
+/// time of the request; data appended later are not included.
 #[utoipa::path(
     get,
     path = "/recordings/{name}/archive",
@@ -161,8 +161,8 @@ impl Part {
             Self::File { path, open, left } => (path, open, left),
         };
         let mut file = open.map_or_else(|| file::open_no_link(&path), Ok)?;
-        let mut piece = Vec::with_capacity(PIECE);
-        let most = left.min(PIECE as u64);
+        let mut piece = Vec::with_capacity(READ_BYTES);
+        let most = left.min(READ_BYTES as u64);
         let read = io::Read::take(&mut file, most).read_to_end(&mut piece)? as u64;
         if read < most {
             return Err(io::ErrorKind::UnexpectedEof.into());
@@ -208,7 +208,7 @@ fn answer(content_type: &'static str, mut parts: Vec<Part>) -> Response {
 /// Returns the parts of a tar archive of a bag: for each file its header, its content, and zeros up
 /// to a whole block; at the end two empty blocks.
 fn archive_parts(directory: &FilePath) -> Vec<Part> {
-    const BLOCK: u64 = 512;
+    const TAR_BLOCK_BYTES: u64 = 512;
     let name = directory.file_name().unwrap_or_default();
     let mut parts = Vec::new();
     for RecordingFile { file, bytes } in files(directory) {
@@ -232,7 +232,7 @@ fn archive_parts(directory: &FilePath) -> Vec<Part> {
             open: None,
             left: bytes,
         });
-        let padding = (BLOCK - bytes % BLOCK) % BLOCK;
+        let padding = (TAR_BLOCK_BYTES - bytes % TAR_BLOCK_BYTES) % TAR_BLOCK_BYTES;
         let zeros = vec![0; usize::try_from(padding).unwrap_or_default()];
         parts.push(Part::Bytes(zeros.into()));
     }

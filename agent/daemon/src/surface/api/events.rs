@@ -27,7 +27,7 @@ use super::body_stream::{Pieces, stream_of};
 use super::endpoint::texts;
 use super::parameters::Parameters;
 use super::problem::{Code, Problem, ProblemBody};
-use super::security::Granted;
+use super::security::Rights;
 use crate::config::{Watch, Watchlist};
 use crate::events::EventLog;
 use crate::events::{EVENTS, Position, Reader, Record, Value};
@@ -40,21 +40,21 @@ use ros2probe_wire::DomainId;
 
 /// Slots for the event streams of all listeners. There are fewer slots than connections, so that
 /// other requests still get a connection.
-static STREAMS: LazyLock<Places> = LazyLock::new(|| Places::new(MAX_STREAMS));
+static STREAM_SLOTS: LazyLock<Places> = LazyLock::new(|| Places::new(MAX_STREAMS));
 const MAX_STREAMS: usize = 16;
 /// Time without an event after which a stream sends a comment.
-const BEAT: Duration = Duration::from_secs(15);
+const HEARTBEAT_INTERVAL: Duration = Duration::from_secs(15);
 /// Time after which a disconnected client should reconnect.
-const RETRY: Duration = Duration::from_secs(2);
+const RECONNECT_DELAY: Duration = Duration::from_secs(2);
 /// Maximum number of events formatted per batch, besides the notice of overwritten events.
-const BATCH: usize = StreamEvents::CAP - 1;
+const MAX_BATCH: usize = StreamEvents::CAP - 1;
 /// Maximum number of names or topics per filter.
 const MAX_FILTERS: usize = 32;
 /// Maximum number of characters in a filter by name, and in a filter by topic.
 const MAX_NAMES: usize = 1_024;
 const MAX_TOPICS: usize = 4_096;
 /// Id of the position before the oldest event in the log.
-const OLDEST: &str = "0";
+const BEFORE_OLDEST_ID: &str = "0";
 
 #[derive(Clone, Debug, Default, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields, default)]
@@ -125,7 +125,7 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
 )]
 async fn events(
     State(context): State<Context>,
-    Extension(granted): Extension<Granted>,
+    Extension(granted): Extension<Rights>,
     headers: HeaderMap,
     Parameters(selection): Parameters<Selection>,
 ) -> Result<Response, Problem> {
@@ -139,13 +139,13 @@ async fn events(
     let log = Arc::clone(&context.events);
     let (place, restarted) = match last_event_id.or(selection.after.as_deref()) {
         None => (log.last(), false),
-        Some(OLDEST) => (0, false),
+        Some(BEFORE_OLDEST_ID) => (0, false),
         Some(id) => match log.position(id).ok_or_else(|| no_id(id))? {
             Position::After(number) => (number, false),
             Position::Unknown => (0, true),
         },
     };
-    let permit = STREAMS.take(granted.is_holder()).ok_or_else(|| {
+    let permit = STREAM_SLOTS.take(granted.has_token()).ok_or_else(|| {
         let detail = format!("{MAX_STREAMS} streams are open, which is the limit");
         Problem::new(Code::TooManyStreams, detail)
     })?;
@@ -188,7 +188,7 @@ impl Pieces for Stream {
                 biased;
                 () = self.log.wait(self.place) => {}
                 () = self.stop.cancelled() => return None,
-                () = sleep(BEAT) => {
+                () = sleep(HEARTBEAT_INTERVAL) => {
                     // The id covers events that the filter left out, so that a reconnecting client
                     // skips them.
                     let beat = Event::default().comment("").id(self.log.id(self.place));
@@ -203,7 +203,7 @@ impl Stream {
     /// Queues a first message with the position, so that a client that disconnects before the first
     /// event can resume there.
     fn begin(&mut self, restarted: bool) {
-        let greeting = Event::default().comment("ros2probe").retry(RETRY);
+        let greeting = Event::default().comment("ros2probe").retry(RECONNECT_DELAY);
         self.waiting.push_back(greeting.id(self.log.id(self.place)));
         if restarted {
             self.lag(None, "restarted");
@@ -211,16 +211,16 @@ impl Stream {
     }
     /// Moves the next selected events into `waiting`. Returns whether the log had new events.
     fn read(&mut self) -> bool {
-        let batch = self.log.read(self.place, BATCH);
+        let batch = self.log.read(self.place, MAX_BATCH);
         if batch.lagged > 0 {
-            self.log.overtook(Reader::Stream, batch.lagged);
+            self.log.count_overwritten(Reader::Stream, batch.lagged);
             self.place += batch.lagged;
             self.lag(Some(batch.lagged), "overwritten");
         }
         for record in batch
             .records
             .iter()
-            .filter(|record| self.filter.wants(record))
+            .filter(|record| self.filter.is_selected(record))
         {
             let message = Event::default()
                 .event(record.definition.name)
@@ -292,7 +292,7 @@ impl Filter {
         })
     }
 
-    fn wants(&self, record: &Record) -> bool {
+    fn is_selected(&self, record: &Record) -> bool {
         let name = record.definition.name;
         let named = self.names.is_empty() || self.names.iter().any(|each| covers(each, name));
         named
@@ -372,7 +372,7 @@ mod tests {
             follow: true,
             place: 0,
             waiting: Bounded::default(),
-            _permit: STREAMS.take(true).unwrap(),
+            _permit: STREAM_SLOTS.take(true).unwrap(),
         }
     }
 

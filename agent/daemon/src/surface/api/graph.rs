@@ -23,7 +23,7 @@ use ros2probe_model::report::snapshot::{Snapshot, TopicFacts};
 
 /// The graph under construction.
 #[derive(Debug, Default)]
-struct Drawing {
+struct GraphBuilder {
     vertices: BTreeMap<String, (VertexKind, u32, String)>,
     edges: BTreeMap<(String, String, EdgeKind), Option<f64>>,
 }
@@ -51,10 +51,10 @@ async fn show(
 }
 
 fn graph(snapshot: &Snapshot, scope: Scope) -> Graph {
-    let mut drawing = Drawing::default();
+    let mut drawing = GraphBuilder::default();
     for node in &snapshot.nodes {
         let is_hidden = node.name.split('/').any(|token| token.starts_with('_'));
-        if scope.admits(node.domain_id) && (scope.shows_hidden() || !is_hidden) {
+        if scope.includes(node.domain_id) && (scope.shows_hidden() || !is_hidden) {
             drawing.vertex(VertexKind::Node, node.domain_id.0, &node.name);
         }
     }
@@ -63,21 +63,21 @@ fn graph(snapshot: &Snapshot, scope: Scope) -> Graph {
             topic.kind,
             TopicKind::ServiceRequest | TopicKind::ServiceReply | TopicKind::Discovery
         );
-        let is_shown = scope.admits(topic.domain_id) && (scope.shows_hidden() || !topic.hidden);
+        let is_shown = scope.includes(topic.domain_id) && (scope.shows_hidden() || !topic.hidden);
         if is_topic && is_shown && !topic.vanished {
             drawing.topic(topic);
         }
     }
     for ((domain_id, name), halves) in services(snapshot, scope) {
-        drawing.joint(VertexKind::Service, domain_id.0, name, &halves.parties());
+        drawing.add_service_or_action(VertexKind::Service, domain_id.0, name, &halves.parties());
     }
     for ((domain_id, name), parts) in actions(snapshot, scope) {
-        drawing.joint(VertexKind::Action, domain_id.0, &name, &parties(&parts));
+        drawing.add_service_or_action(VertexKind::Action, domain_id.0, &name, &parties(&parts));
     }
     drawing.view(snapshot)
 }
 
-impl Drawing {
+impl GraphBuilder {
     fn vertex(&mut self, kind: VertexKind, domain_id: u32, name: &str) -> String {
         let word = match kind {
             VertexKind::Node => "node",
@@ -95,7 +95,7 @@ impl Drawing {
     }
 
     /// Adds a node, or its participant if the node is unknown. Returns the id of the vertex.
-    fn party(&mut self, domain_id: u32, (node, participant): (Option<&str>, Guid)) -> String {
+    fn add_party(&mut self, domain_id: u32, (node, participant): (Option<&str>, Guid)) -> String {
         match node {
             Some(node) => self.vertex(VertexKind::Node, domain_id, node),
             None => {
@@ -111,7 +111,7 @@ impl Drawing {
         let participant = |guid: Guid| Guid::new(guid.prefix, EntityId::PARTICIPANT);
         for publisher in &facts.publishers {
             let party = (publisher.node.as_deref(), participant(publisher.guid));
-            let node = self.party(domain_id, party);
+            let node = self.add_party(domain_id, party);
             let rate = publisher.measurement.as_ref().map(|it| it.rate_hz);
             let rate = rate.filter(|rate| *rate > 0.0 || facts.rate_hz().is_some());
             let key = (node, topic.clone(), EdgeKind::Publishes);
@@ -122,25 +122,31 @@ impl Drawing {
         }
         for subscription in &facts.subscriptions {
             let party = (subscription.node.as_deref(), participant(subscription.guid));
-            let node = self.party(domain_id, party);
+            let node = self.add_party(domain_id, party);
             let key = (topic.clone(), node, EdgeKind::Feeds);
             self.edges.insert(key, None);
         }
     }
 
     /// Adds a service or action with its edges, unless it has no endpoints.
-    fn joint(&mut self, kind: VertexKind, domain_id: u32, name: &str, parties: &Parties<'_>) {
+    fn add_service_or_action(
+        &mut self,
+        kind: VertexKind,
+        domain_id: u32,
+        name: &str,
+        parties: &Parties<'_>,
+    ) {
         if parties.is_empty() {
             return;
         }
         let joint = self.vertex(kind, domain_id, name);
         for server in parties.servers.keys() {
-            let node = self.party(domain_id, *server);
+            let node = self.add_party(domain_id, *server);
             let key = (joint.clone(), node, EdgeKind::ServedBy);
             self.edges.insert(key, None);
         }
         for client in parties.clients.keys() {
-            let node = self.party(domain_id, *client);
+            let node = self.add_party(domain_id, *client);
             let key = (node, joint.clone(), EdgeKind::Calls);
             self.edges.insert(key, None);
         }

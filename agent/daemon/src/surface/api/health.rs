@@ -21,7 +21,7 @@ use ros2probe_api::health::{self, Health, Interface, Limit, Table, Thread};
 use ros2probe_metrics::otlp::Host;
 
 /// Name of the host. It is read once, because it rarely changes while the agent runs.
-pub(super) static HOST: LazyLock<Option<String>> = LazyLock::new(|| Host::read().name);
+pub(super) static HOST_NAME: LazyLock<Option<String>> = LazyLock::new(|| Host::read().name);
 
 pub(super) fn routes() -> OpenApiRouter<Context> {
     OpenApiRouter::new().routes(routes!(health))
@@ -41,7 +41,7 @@ async fn health(State(context): State<Context>) -> Json<Health> {
     let (agent, snapshot) = (&state.agent, state.snapshot.as_deref());
     let interfaces = agent.interfaces.iter();
     let tables = snapshot.into_iter().flat_map(|snapshot| &snapshot.tables);
-    let age = instant.saturating_duration_since(agent.at);
+    let age = instant.saturating_duration_since(agent.collected_at);
     let started = Process::read().start_time;
     let now = SystemTime::UNIX_EPOCH.elapsed().unwrap_or_default();
     let threads = privilege::threads();
@@ -56,12 +56,12 @@ async fn health(State(context): State<Context>) -> Json<Health> {
         ready: ready.is_ok(),
         reason: ready.err().map(|reason| reason.to_string()),
         degraded: context.limits.degraded(&state),
-        host: HOST.clone(),
+        host: HOST_NAME.clone(),
         version: env!("CARGO_PKG_VERSION").into(),
         source: agent.source.label().into(),
         finished: agent.finished,
         age_seconds: snapshot.map(|_| age.as_secs_f64()),
-        watches: context.watches.in_force().entries().len(),
+        watches: context.watches.active().entries().len(),
         watches_kept: context.watches.is_kept(),
         dropped_packets: interfaces.clone().filter_map(|each| each.dropped).sum(),
         dropped_records: agent.records_dropped,
@@ -176,7 +176,10 @@ fn ros2_daemon(figures: &Ros2DaemonFigures) -> Vec<health::Ros2DaemonPort> {
 
 fn abilities(agent: &AgentFacts) -> Vec<health::Ability> {
     let view = |ability: Ability| {
-        let reason = agent.blind.iter().find(|(blind, _)| *blind == ability);
+        let reason = agent
+            .missing_abilities
+            .iter()
+            .find(|(blind, _)| *blind == ability);
         health::Ability {
             ability: ability.label().into(),
             able: agent.abilities.contains(&ability),

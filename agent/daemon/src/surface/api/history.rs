@@ -13,11 +13,11 @@ use ros2probe_api::topics::History;
 
 /// The last minutes of a topic
 ///
-/// Without `from`, `to` and `step`, the answer covers as many seconds as `page.history_s`, the oldest
-/// first. With one of them it covers these times in the history on disk, also of a topic that no
-/// longer exists. A topic has a history while it is measured. A path such as `/topics/camera/history` means the topic `/camera/history`
-/// if that topic exists. With encoded slashes (`/topics/%2Fcamera%2Fimage/history`), the path is
-/// unambiguous.
+/// Without `from`, `to` and `step`, the answer covers as many seconds as `page.history_s`, the
+/// oldest first. With one of them it covers these times in the history on disk, also of a topic
+/// that no longer exists. A topic has a history while it is measured. A path such as
+/// `/topics/camera/history` means the topic `/camera/history` if that topic exists. With encoded
+/// slashes (`/topics/%2Fcamera%2Fimage/history`), the path is unambiguous.
 #[utoipa::path(
     get,
     path = "/topics/{topic}/history",
@@ -56,7 +56,8 @@ pub(super) async fn show(
             continue;
         }
         let part = |pair: Option<[f32; 2]>, place: usize| {
-            pair.and_then(|pair| pair.get(place).copied()).map(short)
+            pair.and_then(|pair| pair.get(place).copied())
+                .map(stored_precision)
         };
         let latency = row.and_then(|row| row.latency());
         let interarrival = row.and_then(|row| row.interarrival());
@@ -79,7 +80,7 @@ pub(super) async fn show(
 }
 
 /// Rounds to the precision of a stored percentile.
-pub(super) fn short(value: f32) -> f64 {
+pub(super) fn stored_precision(value: f32) -> f64 {
     let value = f64::from(value);
     if value <= 0.0 || !value.is_finite() {
         return 0.0;
@@ -104,10 +105,17 @@ mod tests {
 
     #[test]
     fn numbers_are_rounded_to_their_significant_digits() {
-        assert_eq!(short(0.001_234_567), 0.001_23);
-        assert_eq!(short(12.345_678), 12.3);
-        assert_eq!(short(1234.5), 1235.0);
-        assert_eq!((short(0.0), short(-1.0), short(f32::NAN)), (0.0, 0.0, 0.0));
+        assert_eq!(stored_precision(0.001_234_567), 0.001_23);
+        assert_eq!(stored_precision(12.345_678), 12.3);
+        assert_eq!(stored_precision(1234.5), 1235.0);
+        assert_eq!(
+            (
+                stored_precision(0.0),
+                stored_precision(-1.0),
+                stored_precision(f32::NAN)
+            ),
+            (0.0, 0.0, 0.0)
+        );
         assert_eq!(thousandths(9.987_654), 9.988);
     }
 }

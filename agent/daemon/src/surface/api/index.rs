@@ -10,7 +10,7 @@ use ros2probe_model::report::snapshot::{
 };
 
 /// A watchlist entry and the state of a topic under it.
-pub(super) type Standing<'a> = (&'a WatchFacts, &'a WatchedTopicFacts);
+pub(super) type WatchedTopic<'a> = (&'a WatchFacts, &'a WatchedTopicFacts);
 
 /// The lookup tables of an answer.
 #[derive(Debug)]
@@ -18,7 +18,7 @@ pub(super) struct Index<'a> {
     participants: HashMap<GuidPrefix, &'a ParticipantFacts>,
     clocks: HashMap<GuidPrefix, &'a PeerClock>,
     findings: HashMap<(DomainId, &'a str), Vec<&'a Diagnosis>>,
-    watches: HashMap<(DomainId, &'a str), Vec<Standing<'a>>>,
+    watches: HashMap<(DomainId, &'a str), Vec<WatchedTopic<'a>>>,
 }
 
 /// Endpoints with their topics, by GUID.
@@ -70,7 +70,7 @@ impl<'a> Index<'a> {
 
     /// Returns the watchlist entries that cover a topic. Request and reply topics share the name of
     /// their service, so entries apply only to measured topics.
-    pub(super) fn watches(&self, topic: &'a TopicFacts) -> &[Standing<'a>] {
+    pub(super) fn watches(&self, topic: &'a TopicFacts) -> &[WatchedTopic<'a>] {
         if topic.measurement.is_none() {
             return &[];
         }

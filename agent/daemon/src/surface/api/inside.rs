@@ -200,14 +200,16 @@ fn late(facts: &TopicFacts, snapshot: &Snapshot) -> Option<RecentLateCalls<'stat
     for entry in recent {
         calls += 1;
         longest = longest.max(entry.total);
-        *causes.entry((entry.cause, &entry.culprit)).or_insert(0) += 1;
+        *causes
+            .entry((entry.cause, &entry.other_thread))
+            .or_insert(0) += 1;
     }
-    let ((cause, culprit), _) = causes.into_iter().max_by_key(|(_, calls)| *calls)?;
+    let ((cause, by_thread), _) = causes.into_iter().max_by_key(|(_, calls)| *calls)?;
     Some(RecentLateCalls {
         calls,
         longest_seconds: longest.as_secs_f64(),
         cause: cause.label().into(),
-        words: cause.in_words(culprit.as_ref().map(|by| by as _)).into(),
+        words: cause.in_words(by_thread.as_ref().map(|by| by as _)).into(),
     })
 }
 

@@ -18,18 +18,23 @@ const MAX_KEPT: usize = 200;
 const MAX_ENTRIES: usize = 10_000;
 
 /// The latest list. The metadata of a bag is read once, until the bag changes.
-static LISTED: Mutex<Vec<KeptBag>> = Mutex::new(Vec::new());
+static LISTED_BAGS: Mutex<Vec<KeptBag>> = Mutex::new(Vec::new());
 
 /// Returns the bags in a directory without those of these names, the latest first. It reads the
 /// directory, and so it blocks.
 pub(super) fn kept(root: &Path, known: &BTreeSet<String>) -> Vec<KeptBag> {
-    let mut listed = LISTED.lock().unwrap_or_else(PoisonError::into_inner);
-    *listed = among(root, known, MAX_ENTRIES, &listed);
+    let mut listed = LISTED_BAGS.lock().unwrap_or_else(PoisonError::into_inner);
+    *listed = bags_among(root, known, MAX_ENTRIES, &listed);
     listed.clone()
 }
 
 /// Returns the bags among this number of entries. `before` is an earlier list.
-fn among(root: &Path, known: &BTreeSet<String>, most: usize, before: &[KeptBag]) -> Vec<KeptBag> {
+fn bags_among(
+    root: &Path,
+    known: &BTreeSet<String>,
+    most: usize,
+    before: &[KeptBag],
+) -> Vec<KeptBag> {
     let entries = fs::read_dir(root).into_iter().flatten();
     let bags = entries.take(most).filter_map(|entry| {
         let entry = entry.ok()?;
@@ -135,6 +140,6 @@ mod tests {
             bag(root, &format!("bag_{number}"), "bag_0.mcap");
         }
         assert_eq!(kept(root, &BTreeSet::new()).len(), MAX_KEPT);
-        assert_eq!(among(root, &BTreeSet::new(), 3, &[]).len(), 3);
+        assert_eq!(bags_among(root, &BTreeSet::new(), 3, &[]).len(), 3);
     }
 }

@@ -21,8 +21,8 @@ use ros2probe_model::report::snapshot::{self, NodeLogFacts};
 use ros2probe_wire::log::LogLevel;
 
 /// Number of messages in an answer by default, and at most.
-const LIMIT: usize = 100;
-const MOST: usize = LogMessages::CAP;
+const DEFAULT_LIMIT: usize = 100;
+const MAX_LIMIT: usize = LogMessages::CAP;
 
 /// The query of `/logs`.
 #[derive(Clone, Debug, Default, Deserialize, IntoParams)]
@@ -73,9 +73,9 @@ async fn logs(
         None => LogLevel::Debug,
         Some(name) => labelled("level", name, &LogLevel::ALL, LogLevel::label)?,
     };
-    let limit = of.limit.unwrap_or(LIMIT);
-    if limit > MOST {
-        let detail = format!("the agent keeps {MOST} messages: `limit` is at most that");
+    let limit = of.limit.unwrap_or(DEFAULT_LIMIT);
+    if limit > MAX_LIMIT {
+        let detail = format!("the agent keeps {MAX_LIMIT} messages: `limit` is at most that");
         return Err(Problem::new(Code::InvalidRequest, detail));
     }
     let state = context.state().await;

@@ -113,7 +113,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn percentiles_lie_within_their_buckets_and_the_range() {
+    fn percentiles_are_within_their_buckets_and_the_range() {
         let mut values = Histogram::default();
         for _ in 0..98 {
             values.observe(0.0015);

@@ -88,16 +88,16 @@ pub use pipe::serve as serve_in_process;
 use problem::{Code, Problem};
 use reload::Reloader;
 use ros2probe_message::Library;
-use security::{Door, Needs};
+use security::{AccessRules, RequiredRights};
 pub use server::{OpenError, Server};
 
 /// Maximum time that a request waits for a fresh snapshot, which shows the effects of earlier
 /// requests.
-const TIMEOUT: Duration = Duration::from_millis(600);
+const FRESH_STATE_TIMEOUT: Duration = Duration::from_millis(600);
 /// Maximum time that a request waits until calls inside processes are observed.
-const CALLS_WITHIN: Duration = Duration::from_secs(5);
+const CALL_OBSERVATION_TIMEOUT: Duration = Duration::from_secs(5);
 /// Interval at which the request checks for the observation.
-const CALLS_POLLED: Duration = Duration::from_millis(250);
+const CALL_POLL_INTERVAL: Duration = Duration::from_millis(250);
 
 /// State that the routes share.
 #[derive(Clone)]
@@ -142,10 +142,10 @@ impl Context {
     /// Requests the observation of calls inside processes, and waits at most five seconds until
     /// their rates are known.
     async fn observe_calls(&self) {
-        self.latest.want_calls();
+        self.latest.request_calls();
         let is_known = async {
             loop {
-                self.latest.refresh(TIMEOUT).await;
+                self.latest.refresh(FRESH_STATE_TIMEOUT).await;
                 let state = self.latest.own_state();
                 let source = state.agent.inside.as_ref();
                 // Only the mode `auto` needs a wait. In other modes, calls are always observed or
@@ -153,22 +153,22 @@ impl Context {
                 if source.is_none_or(|source| source.mode != "auto" || source.shows_rates) {
                     return;
                 }
-                tokio::time::sleep(CALLS_POLLED).await;
+                tokio::time::sleep(CALL_POLL_INTERVAL).await;
             }
         };
-        let _ = tokio::time::timeout(CALLS_WITHIN, is_known).await;
+        let _ = tokio::time::timeout(CALL_OBSERVATION_TIMEOUT, is_known).await;
     }
 
     /// Returns the current state, or a slightly older one if the capture is busy.
     async fn state(&self) -> Arc<State> {
-        self.latest.refresh(TIMEOUT).await;
+        self.latest.refresh(FRESH_STATE_TIMEOUT).await;
         self.latest.state()
     }
 }
 
 /// Returns the name of this host.
 pub(super) fn host() -> Option<String> {
-    health::HOST.clone()
+    health::HOST_NAME.clone()
 }
 
 /// Returns the routes of all nouns with their part of the document.
@@ -186,8 +186,11 @@ fn nouns(context: Option<&Context>) -> OpenApiRouter<Context> {
         None => views,
     };
     let needs = |read, change, routes: OpenApiRouter<Context>| {
-        let needs = Needs { read, change };
-        routes.layer(middleware::from_fn_with_state(needs, security::within))
+        let needs = RequiredRights { read, change };
+        routes.layer(middleware::from_fn_with_state(
+            needs,
+            security::require_rights,
+        ))
     };
     OpenApiRouter::with_openapi(openapi::head())
         .merge(needs(Access::Read, Access::Watch, watch::routes()))
@@ -239,7 +242,7 @@ async fn observe_calls(
 }
 
 /// Large answers that are being created and read.
-static VIEWS: LargeResponses = LargeResponses::new();
+static VIEW_RESPONSES: LargeResponses = LargeResponses::new();
 
 /// Marks a streamed response, which is sent as it is produced and keeps no permit for a large
 /// answer.
@@ -248,7 +251,7 @@ struct Streamed;
 
 /// Limits the number of large answers, as [`super::large_responses`] describes.
 async fn take_turns(Extract(context): Extract<Context>, request: Request, next: Next) -> Response {
-    let Some(turn) = VIEWS.turn().await else {
+    let Some(turn) = VIEW_RESPONSES.permit().await else {
         context.limits.reached(Limit::ApiClients, 1);
         let detail = "memory for responses is used up by slow readers";
         return Problem::new(Code::TooManyClients, detail).into_response();
@@ -261,14 +264,14 @@ async fn take_turns(Extract(context): Extract<Context>, request: Request, next: 
     match to_bytes(body, usize::MAX).await {
         Ok(bytes) => {
             head.headers.insert(CONTENT_LENGTH, bytes.len().into());
-            Response::from_parts(head, turn.keep(bytes))
+            Response::from_parts(head, turn.body(bytes))
         }
         Err(_) => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
     }
 }
 
 /// Returns the routes with the access checks of `door`.
-fn router(context: &Context, door: Arc<Door>) -> Router {
+fn router(context: &Context, door: Arc<AccessRules>) -> Router {
     let (router, _) = nouns(Some(context)).split_for_parts();
     let files = (door.is_for_browsers() && context.page.is_served()).then(|| {
         let guard = middleware::from_fn_with_state(Arc::clone(&door), security::guard_files);

@@ -59,7 +59,7 @@ fn names(snapshot: &Snapshot, scope: Scope) -> Names<'_> {
         }
     });
     let is_shown =
-        |domain_id, hidden: bool| scope.admits(domain_id) && (!hidden || scope.shows_hidden());
+        |domain_id, hidden: bool| scope.includes(domain_id) && (!hidden || scope.shows_hidden());
     let topics = snapshot.topics.iter().filter_map(topic);
     let mut topics: Vec<_> = topics
         .filter(|topic| is_shown(DomainId(topic.domain_id), topic.hidden))
@@ -74,7 +74,7 @@ fn names(snapshot: &Snapshot, scope: Scope) -> Names<'_> {
         timestamp_seconds: snapshot.time().seconds(),
         participants: participants
             .clone()
-            .filter(|each| scope.admits(each.domain_id))
+            .filter(|each| scope.includes(each.domain_id))
             .count(),
         unknown_writers: snapshot.unknown_writers.len(),
         remedy: missed_announcements::remedy(snapshot).map(Cow::Borrowed),

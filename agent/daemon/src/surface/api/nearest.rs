@@ -1,9 +1,9 @@
 //! Suggestions for names that do not exist.
 
 /// Maximum number of suggestions.
-const SUGGESTIONS: usize = 3;
+const MAX_SUGGESTIONS: usize = 3;
 /// Maximum number of names compared.
-const COMPARED: usize = 2000;
+const MAX_COMPARED: usize = 2000;
 
 /// Returns "; did you mean ...?", or an empty string without a similar name.
 pub(super) fn hint<'a>(wanted: &str, names: impl Iterator<Item = &'a str>) -> String {
@@ -17,7 +17,7 @@ pub(super) fn hint<'a>(wanted: &str, names: impl Iterator<Item = &'a str>) -> St
 /// Returns the most similar names, the nearest first.
 fn nearest<'a>(wanted: &str, names: impl Iterator<Item = &'a str>) -> Vec<&'a str> {
     let limit = (wanted.len() / 4).clamp(2, 6);
-    let near = names.take(COMPARED).filter_map(|name| {
+    let near = names.take(MAX_COMPARED).filter_map(|name| {
         // The wanted name lacks a namespace, or has one too many.
         let is_end = name.ends_with(wanted) || wanted.ends_with(name);
         let steps = distance(wanted.as_bytes(), name.as_bytes(), limit);
@@ -31,7 +31,7 @@ fn nearest<'a>(wanted: &str, names: impl Iterator<Item = &'a str>) -> Vec<&'a st
     let mut near: Vec<_> = near.collect();
     near.sort_unstable();
     near.dedup();
-    near.truncate(SUGGESTIONS);
+    near.truncate(MAX_SUGGESTIONS);
     near.into_iter().map(|(_, name)| name).collect()
 }
 

@@ -58,7 +58,7 @@ async fn list(
     let nodes = nodes(snapshot).filter(|nodes| {
         let first = nodes.first();
         first.is_some_and(|node| {
-            scope.admits(node.domain_id) && (scope.shows_hidden() || !is_hidden(&node.name))
+            scope.includes(node.domain_id) && (scope.shows_hidden() || !is_hidden(&node.name))
         })
     });
     let answer = NodeList {
@@ -92,7 +92,7 @@ async fn show(
     let snapshot = state.known();
     let admitted = || {
         let all = nodes(snapshot).filter_map(|nodes| Some((nodes.first()?, nodes)));
-        all.filter(|(node, _)| scope.admits(node.domain_id))
+        all.filter(|(node, _)| scope.includes(node.domain_id))
     };
     let found = admitted().filter(|(node, _)| *node.name == *name);
     let found = found.map(|(node, nodes)| (node.domain_id, nodes)).collect();

@@ -21,7 +21,7 @@ use super::problem::{MEDIA_TYPE, ProblemBody};
 use super::{Context, nouns};
 
 /// Error responses that any request may receive.
-const COMMON: [(&str, &str); 6] = [
+const COMMON_ERRORS: [(&str, &str); 6] = [
     ("400", "The request cannot be read."),
     ("401", "The listener requires a bearer token."),
     (
@@ -132,7 +132,7 @@ fn complete(operation: &mut Operation) {
     if let Some(RefOr::T(body)) = &mut operation.request_body {
         body.required = Some(Required::False);
     }
-    for (status, description) in COMMON {
+    for (status, description) in COMMON_ERRORS {
         let problem = ContentBuilder::new().schema(Some(Ref::from_schema_name("Problem")));
         let response = ResponseBuilder::new()
             .description(description)
@@ -226,7 +226,7 @@ fn take_default(schema: &mut RefOr<Schema>) -> Option<Value> {
     responses((status = 200, description = "OpenAPI 3.1.", body = Object))
 )]
 async fn openapi() -> impl IntoResponse {
-    static TEXT: LazyLock<String> =
+    static DOCUMENT_TEXT: LazyLock<String> =
         LazyLock::new(|| document().to_pretty_json().unwrap_or_default());
-    ([(CONTENT_TYPE, "application/json")], TEXT.as_str())
+    ([(CONTENT_TYPE, "application/json")], DOCUMENT_TEXT.as_str())
 }

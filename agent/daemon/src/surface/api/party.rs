@@ -105,14 +105,16 @@ pub(super) fn action(topic: &TopicFacts) -> Option<(RosName, ActionPart)> {
 /// Returns the action type for the type of one of its topics, or `None` if the topic's type does
 /// not contain it.
 pub(super) fn action_type(message_type: &str) -> Option<&str> {
-    const ENDS: [&str; 5] = [
+    const ACTION_ENDS: [&str; 5] = [
         "_FeedbackMessage",
         "_SendGoal_Request",
         "_SendGoal_Response",
         "_GetResult_Request",
         "_GetResult_Response",
     ];
-    ENDS.iter().find_map(|end| message_type.strip_suffix(end))
+    ACTION_ENDS
+        .iter()
+        .find_map(|end| message_type.strip_suffix(end))
 }
 
 #[cfg(test)]

@@ -9,7 +9,7 @@ use axum::serve::Listener;
 use tokio::io::DuplexStream;
 use tokio::sync::mpsc;
 
-use super::security::{Door, Granted, Kind};
+use super::security::{AccessRules, Kind, Rights};
 use super::{Context, router};
 use crate::config::Access;
 
@@ -42,7 +42,7 @@ pub async fn serve(
     pipes: mpsc::UnboundedReceiver<DuplexStream>,
     context: Context,
 ) -> io::Result<()> {
-    let granted = Granted::new(Access::All, None);
-    let router = router(&context, Arc::new(Door::new(Kind::Socket, granted)));
+    let granted = Rights::new(Access::All, None);
+    let router = router(&context, Arc::new(AccessRules::new(Kind::Socket, granted)));
     axum::serve(Pipes(pipes), router).await
 }

@@ -15,20 +15,20 @@ use ros2probe_model::report::snapshot::{
 
 /// Facts, besides the topic, on which reasons depend.
 #[derive(Debug)]
-pub(super) struct Circumstances<'a> {
+pub(super) struct ReasonInputs<'a> {
     pub(super) snapshot: &'a Snapshot,
     pub(super) index: Index<'a>,
     pub(super) watchlist: &'a Watchlist,
     pub(super) source: SourceKind,
     /// Whether the agent samples shared memory.
-    pub(super) looks_at_memory: bool,
+    pub(super) samples_shared_memory: bool,
     /// Whether the agent could count calls inside processes but does not.
-    pub(super) lacks_inside: bool,
+    pub(super) misses_inside_calls: bool,
     /// Why the agent is not ready.
     pub(super) unready: Option<Unready>,
 }
 
-impl<'a> Circumstances<'a> {
+impl<'a> ReasonInputs<'a> {
     /// Returns all reasons; empty for a topic whose messages are counted.
     pub(super) fn reasons(&self, topic: &'a TopicFacts) -> Vec<Reason> {
         let mut reasons = Vec::new();
@@ -85,7 +85,7 @@ impl<'a> Circumstances<'a> {
                     say(ReasonCode::Quiet, detail);
                 } else if let Some((code, detail)) = self.off_network(topic) {
                     say(code, detail);
-                } else if measured.last_message.is_none() && self.is_elsewhere(topic) {
+                } else if measured.last_message.is_none() && self.is_on_other_hosts(topic) {
                     let detail = "publishers and subscribers are on other hosts; capture.source: \
                         wire sees traffic that passes this host";
                     say(ReasonCode::OutsideView, detail.to_owned());
@@ -166,14 +166,14 @@ impl<'a> Circumstances<'a> {
         if passages.clone().any(|count| count.transport.is_network()) {
             return None;
         }
-        let remedy = match self.lacks_inside {
+        let remedy = match self.misses_inside_calls {
             true => "; `capture.inside: topics` counts such messages",
             false => "",
         };
         let detail = |how: &str| format!("{how}; nothing crosses the network{remedy}");
         Some(match most.transport {
             Transport::Network | Transport::Tcp => return None,
-            Transport::SharedMemory if self.looks_at_memory => {
+            Transport::SharedMemory if self.samples_shared_memory => {
                 let how = "messages pass through shared memory; none was seen lately";
                 (ReasonCode::SharedMemory, detail(how))
             }
@@ -198,7 +198,7 @@ impl<'a> Circumstances<'a> {
 
     /// Returns whether the agent captures at sockets and no participant of the topic has a known
     /// socket on this host.
-    fn is_elsewhere(&self, topic: &'a TopicFacts) -> bool {
+    fn is_on_other_hosts(&self, topic: &'a TopicFacts) -> bool {
         let mut all = topic.publishers.iter().chain(&topic.subscriptions);
         self.source == SourceKind::Host
             && all.all(|endpoint| {

@@ -23,20 +23,20 @@ use super::kept;
 use super::problem::{Code, Problem, ProblemBody};
 use super::scope::domain;
 use super::security::MAX_BODY;
-use super::turns::in_turn;
+use super::turns::run_blocking;
 use crate::recording::{Command, Recording, RecordingOptions, Refusal};
 use ros2probe_api::recordings::{self as answers, FilterOptions, RecordingList, RecordingRequest};
 use ros2probe_bag::{Form, Options, Storage};
 
 /// Maximum time that an answer waits for a bag to be completed.
-const TIMEOUT: Duration = Duration::from_secs(10);
+const COMPLETION_TIMEOUT: Duration = Duration::from_secs(10);
 /// Maximum time that a new recording waits for the capture to apply its subscription, and for
 /// breakpoints in the processes that send the messages.
-const BEGINS_WITHIN: Duration = Duration::from_secs(6);
+const START_TIMEOUT: Duration = Duration::from_secs(6);
 /// Maximum time that the list of recordings waits for the storage. The kept bags are absent then.
-const LISTED_WITHIN: Duration = Duration::from_secs(2);
+const LIST_TIMEOUT: Duration = Duration::from_secs(2);
 /// One thread at a time reads the directory.
-static LISTING: Semaphore = Semaphore::const_new(1);
+static LISTING_PERMIT: Semaphore = Semaphore::const_new(1);
 /// Maximum duration of one file: a year, in seconds.
 const MAX_DURATION: u64 = 31_536_000;
 
@@ -63,7 +63,7 @@ async fn list(State(context): State<Context>) -> Json<RecordingList> {
     let directory = context.recordings.directory();
     let known = recordings.iter().map(|each| each.name.clone()).collect();
     let root = directory.map(FilePath::to_owned);
-    let listed = in_turn(&LISTING, LISTED_WITHIN, move || {
+    let listed = run_blocking(&LISTING_PERMIT, LIST_TIMEOUT, move || {
         root.map(|root| kept::kept(&root, &known))
     });
     let kept = listed.await.ok().flatten().unwrap_or_default();
@@ -123,7 +123,7 @@ async fn begin(
     // Once the subscription is in force, the kernel's programs capture each message of the
     // requested topics.
     tokio::select! {
-        _ = recording.begin().in_force(BEGINS_WITHIN) => {}
+        _ = recording.begin().in_force(START_TIMEOUT) => {}
         () = context.stop.cancelled() => {}
     }
     let location = format!("/recordings/{}", recording.name);
@@ -172,7 +172,7 @@ async fn end(
 ) -> Result<Response, Problem> {
     let recording = find(&context, &name)?;
     recording.command(Command::Stop);
-    let status = if recording.over(TIMEOUT).await {
+    let status = if recording.wait_complete(COMPLETION_TIMEOUT).await {
         StatusCode::OK
     } else {
         StatusCode::ACCEPTED
@@ -286,7 +286,7 @@ fn wanted(request: RecordingRequest) -> Result<RecordingOptions, Problem> {
     Ok(RecordingOptions {
         options: options().map_err(|error| invalid(error.to_string()))?,
         name: request.name,
-        asked,
+        requested: asked,
         domain_id: request.domain_id,
         paused: request.paused,
     })
@@ -326,7 +326,7 @@ fn view(recording: &Recording) -> answers::Recording {
         file_bytes: status.file_bytes,
         files: status.files,
         error: status.error,
-        topics: recording.asked.clone(),
+        topics: recording.requested.clone(),
         report: status.report,
     }
 }

@@ -20,7 +20,7 @@ use ros2probe_wire::Timestamp;
 use ros2probe_wire::time::SECOND;
 
 /// Maximum multiple of the speed of the capture.
-const FASTEST: f64 = 1000.0;
+const MAX_SPEED: f64 = 1000.0;
 
 pub(super) fn routes() -> OpenApiRouter<Context> {
     OpenApiRouter::new()
@@ -101,7 +101,7 @@ fn requested(request: &ReplayRequest, now: Timestamp) -> Result<Pace, Problem> {
     let speed = match request.speed {
         None => None,
         Some(0.0) => Some(Speed::Max),
-        Some(times) if times > 0.0 && times <= FASTEST => Some(Speed::Times(times)),
+        Some(times) if times > 0.0 && times <= MAX_SPEED => Some(Speed::Times(times)),
         Some(_) => return Err(invalid("`speed` must be between 0 and 1000")),
     };
     let jump = match request.to_timestamp_seconds {
@@ -139,7 +139,7 @@ fn view(state: &Known, pace: Pace) -> ReplayState {
         timestamp_seconds: state.known().time().seconds(),
         read_ratio: agent.replayed,
         is_finished: agent.finished,
-        is_paused: pace.is_still(),
+        is_paused: pace.is_paused(),
         speed: pace.times(agent.replay_speed),
         is_jumping: pace.jump.is_some() && !agent.finished,
     }
@@ -150,7 +150,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_replay_goes_only_forward_at_a_possible_speed() {
+    fn replay_requests_backwards_or_at_an_invalid_speed_are_refused() {
         let now = Timestamp(100 * SECOND);
         let of = |change: fn(&mut ReplayRequest)| {
             let mut request = ReplayRequest::default();

@@ -26,7 +26,7 @@ use super::endpoint::printed;
 use super::parameters::Parameters;
 use super::problem::{Code, Problem, ProblemBody};
 use super::scope::domain;
-use super::security::Granted;
+use super::security::Rights;
 use crate::agent_facts::SourceKind;
 use crate::config::Access;
 use crate::subscriptions::line::{line, offered};
@@ -48,14 +48,14 @@ const BATCH_BYTES: usize = 16 * 1024;
 /// Time for which a live stream collects messages after the first one. One piece for many small
 /// messages saves system calls in agent and client. The times of the messages are still their
 /// capture times.
-const PAUSE: Duration = Duration::from_millis(20);
+const BATCH_DELAY: Duration = Duration::from_millis(20);
 /// Default queue sizes in bytes: for a few thousand arrivals, and for messages with payloads.
 const ARRIVALS_BYTES: usize = 1 << 20;
 const PAYLOADS_BYTES: usize = 16 << 20;
 const LEAST_BYTES: usize = 64 << 10;
 /// Maximum time that the first line waits for the capture to apply the subscription, and for
 /// breakpoints in the processes that send the samples.
-const TIMEOUT: Duration = Duration::from_secs(6);
+const CONFIRMATION_TIMEOUT: Duration = Duration::from_secs(6);
 
 #[derive(Clone, Debug, Default, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields, default)]
@@ -96,7 +96,7 @@ struct Stream {
     /// Payload to send next, after the line of its message.
     payload: Option<Bytes>,
     first: Option<Line>,
-    /// Whether to collect small messages for [`PAUSE`].
+    /// Whether to collect small messages for [`BATCH_DELAY`].
     collects: bool,
     /// Writers whose QoS has been sent.
     introduced: Bounded<DescribedWriters, HashSet<Guid>>,
@@ -133,7 +133,7 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
 )]
 async fn samples(
     State(context): State<Context>,
-    Extension(granted): Extension<Granted>,
+    Extension(granted): Extension<Rights>,
     Parameters(wanted): Parameters<Wanted>,
 ) -> Result<Response, Problem> {
     if wanted.payload {
@@ -170,7 +170,7 @@ async fn samples(
         context.latest.state()
     } else {
         tokio::select! {
-            _ = subscription.in_force(TIMEOUT) => {}
+            _ = subscription.in_force(CONFIRMATION_TIMEOUT) => {}
             // The stream then ends with the reason `agent ends`.
             () = context.stop.cancelled() => {}
         }
@@ -250,7 +250,7 @@ impl Stream {
         };
         if self.collects && matches!(item, Some(Item::Sample(_) | Item::Clock(_))) {
             tokio::select! {
-                () = tokio::time::sleep(PAUSE) => {}
+                () = tokio::time::sleep(BATCH_DELAY) => {}
                 () = self.stop.cancelled() => {}
             }
         }

@@ -39,7 +39,7 @@ impl Scope {
         Ok(self)
     }
 
-    pub(super) fn admits(self, domain_id: DomainId) -> bool {
+    pub(super) fn includes(self, domain_id: DomainId) -> bool {
         self.domain_id.is_none_or(|own| DomainId(own) == domain_id)
     }
 

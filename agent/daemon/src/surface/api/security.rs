@@ -26,8 +26,8 @@ use crate::surface::authority;
 pub(super) const MAX_BODY: usize = 16 << 10;
 /// Sustained number of requests per second and size of a burst. Each listener has one limit for
 /// clients with a token or on the unix socket, one for other clients, and one for refused requests.
-const RATE: f64 = 500.0;
-const BURST: f64 = 1_000.0;
+const REQUEST_RATE: f64 = 500.0;
+const REQUEST_BURST: f64 = 1_000.0;
 /// Valid length of a token. Shorter tokens can be guessed, and a longer file is not a token.
 const TOKEN_BYTES: std::ops::RangeInclusive<usize> = 16..=4096;
 
@@ -62,28 +62,28 @@ pub enum TokenError {
 
 /// The access rules of one listener.
 #[derive(Debug)]
-pub(in crate::surface) struct Door {
+pub(in crate::surface) struct AccessRules {
     kind: Kind,
-    granted: Granted,
+    rights: Rights,
     page: page::Shared,
-    holders: Mutex<Bucket>,
-    clients: Mutex<Bucket>,
-    outsiders: Mutex<Bucket>,
+    token_bucket: Mutex<Bucket>,
+    client_bucket: Mutex<Bucket>,
+    refused_bucket: Mutex<Bucket>,
 }
 
 /// The rights that a listener grants to a request.
 #[derive(Clone, Debug)]
-pub(in crate::surface) struct Granted {
+pub(in crate::surface) struct Rights {
     access: Access,
     /// Whether the client sent a valid token or uses the unix socket.
-    is_holder: bool,
+    has_token: bool,
     /// The agent's unix socket, which grants all rights.
     socket: Option<Arc<Path>>,
 }
 
 /// The rights that the routes of a noun need, for reading and for changes.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Needs {
+pub(super) struct RequiredRights {
     pub(super) read: Access,
     pub(super) change: Access,
 }
@@ -137,21 +137,21 @@ impl std::fmt::Debug for Token {
     }
 }
 
-impl Door {
-    pub(in crate::surface) fn new(kind: Kind, granted: Granted) -> Self {
+impl AccessRules {
+    pub(in crate::surface) fn new(kind: Kind, granted: Rights) -> Self {
         let bucket = || {
             Mutex::new(Bucket {
-                left: BURST,
+                left: REQUEST_BURST,
                 at: Instant::now(),
             })
         };
         Self {
             kind,
-            granted,
+            rights: granted,
             page: page::Shared::default(),
-            holders: bucket(),
-            clients: bucket(),
-            outsiders: bucket(),
+            token_bucket: bucket(),
+            client_bucket: bucket(),
+            refused_bucket: bucket(),
         }
     }
 
@@ -166,15 +166,15 @@ impl Door {
     }
 
     /// Checks a request and returns its rights.
-    fn let_in(&self, headers: &HeaderMap, now: Instant) -> Result<Granted, Problem> {
-        let granted = self.pass(self.admit(headers), Granted::is_holder, now)?;
-        small(headers)?;
+    fn check_request(&self, headers: &HeaderMap, now: Instant) -> Result<Rights, Problem> {
+        let granted = self.limit_rate(self.request_rights(headers), Rights::has_token, now)?;
+        check_length(headers)?;
         Ok(granted)
     }
 
     /// Checks a request for a file of the page. The request needs no token, because a browser
     /// requests the page before it can have a token.
-    fn let_in_for_files(&self, headers: &HeaderMap, now: Instant) -> Result<(), Problem> {
+    fn check_file_request(&self, headers: &HeaderMap, now: Instant) -> Result<(), Problem> {
         let host = match self.kind {
             Kind::Loopback(_) => own_host(headers),
             Kind::Socket | Kind::Network(_) => Ok(()),
@@ -188,21 +188,21 @@ impl Door {
             false => own_pages(headers),
         });
         // A browser requests files before it can have a token.
-        self.pass(admitted, |()| false, now)
+        self.limit_rate(admitted, |()| false, now)
     }
 
     /// Checks the handshake of a viewer and returns its rights. Viewers send a token in the URL. A
     /// viewer with a token may be a web page of any origin. Without a token, the web page must be
     /// on this host or among `origins`.
-    pub(in crate::surface) fn let_in_viewer(
+    pub(in crate::surface) fn check_viewer(
         &self,
         headers: &HeaderMap,
         token: Option<&[u8]>,
         origins: &[String],
         now: Instant,
-    ) -> Result<Granted, Problem> {
-        let admitted = self.admit_viewer(headers, token, origins);
-        self.pass(admitted, Granted::is_holder, now)
+    ) -> Result<Rights, Problem> {
+        let admitted = self.viewer_rights(headers, token, origins);
+        self.limit_rate(admitted, Rights::has_token, now)
     }
 
     /// Returns the token that a request needs, if any. Returns `None` for the unix socket, whose
@@ -218,20 +218,20 @@ impl Door {
         })
     }
 
-    fn admit_viewer(
+    fn viewer_rights(
         &self,
         headers: &HeaderMap,
         offered: Option<&[u8]>,
         origins: &[String],
-    ) -> Result<Granted, Problem> {
+    ) -> Result<Rights, Problem> {
         let Some(token) = self.token(headers)? else {
-            return Ok(self.granted.held());
+            return Ok(self.rights.with_token());
         };
         if let Some(offered) = offered.or_else(|| bearer(headers)) {
             let is_right =
-                self.page.tokens.know(offered) || token.is_some_and(|token| token.is(offered));
+                self.page.tokens.is_valid(offered) || token.is_some_and(|token| token.is(offered));
             return match is_right {
-                true => Ok(self.granted.everything()),
+                true => Ok(self.rights.everything()),
                 false => Err(Problem::new(Code::Unauthorized, "the token is wrong")),
             };
         }
@@ -240,44 +240,44 @@ impl Door {
             return Err(Problem::new(Code::Unauthorized, detail));
         }
         viewers_pages(headers, origins)?;
-        Ok(self.granted.clone())
+        Ok(self.rights.clone())
     }
 
     /// Applies the rate limit. Each class of clients has its own limit, which other classes cannot
     /// exhaust.
-    fn pass<T>(
+    fn limit_rate<T>(
         &self,
         admitted: Result<T, Problem>,
         is_holder: impl FnOnce(&T) -> bool,
         now: Instant,
     ) -> Result<T, Problem> {
         let bucket = match &admitted {
-            Ok(granted) if is_holder(granted) => &self.holders,
-            Ok(_) => &self.clients,
-            Err(_) => &self.outsiders,
+            Ok(granted) if is_holder(granted) => &self.token_bucket,
+            Ok(_) => &self.client_bucket,
+            Err(_) => &self.refused_bucket,
         };
         let mut bucket = bucket.lock().unwrap_or_else(PoisonError::into_inner);
         if !bucket.draw(now) {
-            let detail = format!("at most {RATE} requests a second are answered");
+            let detail = format!("at most {REQUEST_RATE} requests a second are answered");
             return Err(Problem::new(Code::TooManyRequests, detail));
         }
         drop(bucket);
         admitted
     }
 
-    fn admit(&self, headers: &HeaderMap) -> Result<Granted, Problem> {
+    fn request_rights(&self, headers: &HeaderMap) -> Result<Rights, Problem> {
         let Some(token) = self.token(headers)? else {
-            return Ok(self.granted.held());
+            return Ok(self.rights.with_token());
         };
         own_pages(headers)?;
-        if bearer(headers).is_some_and(|offered| self.page.tokens.know(offered)) {
-            return Ok(self.granted.everything());
+        if bearer(headers).is_some_and(|offered| self.page.tokens.is_valid(offered)) {
+            return Ok(self.rights.everything());
         }
         let Some(token) = token else {
-            return Ok(self.granted.clone());
+            return Ok(self.rights.clone());
         };
         authorized(headers, token)?;
-        Ok(self.granted.held())
+        Ok(self.rights.with_token())
     }
 }
 
@@ -291,19 +291,19 @@ impl Kind {
     }
 }
 
-impl Granted {
+impl Rights {
     pub(in crate::surface) const fn new(access: Access, socket: Option<Arc<Path>>) -> Self {
         Self {
             access,
-            is_holder: false,
+            has_token: false,
             socket,
         }
     }
 
     /// Returns whether the client sent a valid token or uses the unix socket. Some slots are
     /// reserved for these clients.
-    pub(in crate::surface) const fn is_holder(&self) -> bool {
-        self.is_holder
+    pub(in crate::surface) const fn has_token(&self) -> bool {
+        self.has_token
     }
 
     pub(in crate::surface) const fn access(&self) -> Access {
@@ -314,14 +314,14 @@ impl Granted {
     fn everything(&self) -> Self {
         Self {
             access: Access::All,
-            ..self.held()
+            ..self.with_token()
         }
     }
 
     /// Returns the same rights, for a client with a token or on the unix socket.
-    fn held(&self) -> Self {
+    fn with_token(&self) -> Self {
         Self {
-            is_holder: true,
+            has_token: true,
             ..self.clone()
         }
     }
@@ -354,7 +354,7 @@ impl Granted {
 impl Bucket {
     fn draw(&mut self, now: Instant) -> bool {
         let passed = now.saturating_duration_since(self.at).as_secs_f64();
-        self.left = (self.left + passed * RATE).min(BURST);
+        self.left = (self.left + passed * REQUEST_RATE).min(REQUEST_BURST);
         self.at = now;
         let any = self.left >= 1.0;
         if any {
@@ -366,40 +366,40 @@ impl Bucket {
 
 /// Answers refused requests and closes their connections.
 pub(super) async fn guard(
-    State(door): State<Arc<Door>>,
+    State(door): State<Arc<AccessRules>>,
     mut request: Request,
     next: Next,
 ) -> Response {
-    match door.let_in(request.headers(), Instant::now()) {
+    match door.check_request(request.headers(), Instant::now()) {
         Ok(granted) => {
             request.extensions_mut().insert(granted);
             next.run(request).await
         }
-        Err(problem) => turned_away(problem),
+        Err(problem) => refusal(problem),
     }
 }
 
 /// Answers refused requests for files of the page.
 pub(super) async fn guard_files(
-    State(door): State<Arc<Door>>,
+    State(door): State<Arc<AccessRules>>,
     request: Request,
     next: Next,
 ) -> Response {
-    match door.let_in_for_files(request.headers(), Instant::now()) {
+    match door.check_file_request(request.headers(), Instant::now()) {
         Ok(()) => next.run(request).await,
-        Err(problem) => turned_away(problem),
+        Err(problem) => refusal(problem),
     }
 }
 
-fn turned_away(problem: Problem) -> Response {
+fn refusal(problem: Problem) -> Response {
     let close = [(CONNECTION, HeaderValue::from_static("close"))];
     (close, problem).into_response()
 }
 
 /// Refuses requests that need more rights than the listener grants.
-pub(super) async fn within(
-    State(needs): State<Needs>,
-    Extension(granted): Extension<Granted>,
+pub(super) async fn require_rights(
+    State(needs): State<RequiredRights>,
+    Extension(granted): Extension<Rights>,
     request: Request,
     next: Next,
 ) -> Response {
@@ -491,7 +491,7 @@ fn bearer(headers: &HeaderMap) -> Option<&[u8]> {
 }
 
 /// Checks the declared length of the body. A body without a length is bounded while it is read.
-fn small(headers: &HeaderMap) -> Result<(), Problem> {
+fn check_length(headers: &HeaderMap) -> Result<(), Problem> {
     let length = headers
         .get(CONTENT_LENGTH)
         .and_then(|length| length.to_str().ok());

@@ -15,7 +15,7 @@ use axum::serve::Listener;
 use tokio::task::JoinSet;
 
 use super::problem::{Code, MEDIA_TYPE, Problem, ProblemBody};
-use super::security::{Door, Granted, Kind, Token, TokenError};
+use super::security::{AccessRules, Kind, Rights, Token, TokenError};
 use super::{Context, router};
 use crate::config::{Access, Limit};
 use crate::surface::limited_listener::{LimitedListener, Refusal};
@@ -25,7 +25,7 @@ use crate::surface::serving::{self, Plain};
 /// Read and write permission for owner and group.
 const SOCKET_MODE: u32 = 0o660;
 /// Group that may use the socket of an agent started as root.
-const GROUP: &str = "ros2probe";
+const SOCKET_GROUP: &str = "ros2probe";
 
 /// Why the API cannot be served.
 #[derive(Debug, thiserror::Error)]
@@ -168,7 +168,7 @@ impl Server {
 
     /// Returns the addresses and paths of all listeners, with the port that the kernel chose for
     /// port 0.
-    pub fn doors(&self) -> impl Iterator<Item = String> {
+    pub fn listener_addresses(&self) -> impl Iterator<Item = String> {
         let addresses = self.addresses.iter().map(TcpListener::local_addr);
         let sockets = self.sockets.iter();
         let sockets = sockets.map(|socket| format!("unix:{}", socket.file.path.display()));
@@ -190,8 +190,8 @@ impl Server {
         let socket = self.sockets.first();
         let socket = socket.map(|socket| Arc::from(socket.file.path.as_path()));
         let door = |kind: Kind| {
-            let granted = Granted::new(kind.access(self.loopback), socket.clone());
-            Arc::new(Door::new(kind, granted).with(Arc::clone(&context.page)))
+            let granted = Rights::new(kind.access(self.loopback), socket.clone());
+            Arc::new(AccessRules::new(kind, granted).with(Arc::clone(&context.page)))
         };
         for listener in self.addresses {
             let is_local = listener.local_addr()?.ip().is_loopback();
@@ -222,21 +222,21 @@ impl Drop for SocketFile {
     }
 }
 
-async fn serve<L>(listener: L, door: Arc<Door>, context: Context) -> io::Result<()>
+async fn serve<L>(listener: L, door: Arc<AccessRules>, context: Context) -> io::Result<()>
 where
     L: Listener,
     L::Io: Unpin,
 {
     let router = router(&context, door);
     let limit = Limit::ApiClients;
-    let full = full(context.limits.caps().get(limit));
+    let full = too_many_connections(context.limits.caps().get(limit));
     let listener = LimitedListener::new(listener, Arc::clone(&context.limits), limit, Some(full));
     serving::serve(listener, Plain, router, |_| (), context.stop).await;
     Ok(())
 }
 
 /// Returns the answer to a client beyond the limit of connections.
-fn full(connections: usize) -> Refusal {
+fn too_many_connections(connections: usize) -> Refusal {
     let detail =
         format!("{connections} connections are open, which is the limit (limits.api_clients)");
     let problem = ProblemBody::from(Problem::new(Code::TooManyClients, detail));
@@ -268,14 +268,14 @@ fn lock(path: &Path) -> Result<File, OpenError> {
     }
 }
 
-/// Changes the group of the socket to [`GROUP`] if the agent runs as root and the group exists.
-/// Under the service manager, the agent already has that group. Otherwise the socket keeps the
-/// agent's own group.
+/// Changes the group of the socket to [`SOCKET_GROUP`] if the agent runs as root and the group
+/// exists. Under the service manager, the agent already has that group. Otherwise the socket keeps
+/// the agent's own group.
 fn give_to_group(path: &Path) {
     let groups = fs::read_to_string("/etc/group").unwrap_or_default();
     let group = groups.lines().find_map(|line| {
         let mut fields = line.split(':');
-        let is_ours = fields.next() == Some(GROUP);
+        let is_ours = fields.next() == Some(SOCKET_GROUP);
         fields.nth(1)?.parse().ok().filter(|_| is_ours)
     });
     if let Some(group) = group {
@@ -305,7 +305,7 @@ mod tests {
         fs::write(&token, "0123456789abcdef\n").unwrap();
         let mut server = Server::new(Some(&token), Access::Watch).unwrap();
         server.bind(([0, 0, 0, 0], 0).into()).unwrap();
-        assert_eq!(server.doors().count(), 1);
+        assert_eq!(server.listener_addresses().count(), 1);
     }
 
     #[test]

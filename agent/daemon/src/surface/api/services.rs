@@ -74,7 +74,7 @@ pub(super) fn services(
 ) -> BTreeMap<(DomainId, &str), Halves<'_>> {
     let mut services: BTreeMap<_, Halves<'_>> = BTreeMap::new();
     for topic in &snapshot.topics {
-        let is_shown = scope.admits(topic.domain_id) && (!topic.hidden || scope.shows_hidden());
+        let is_shown = scope.includes(topic.domain_id) && (!topic.hidden || scope.shows_hidden());
         let key = (topic.domain_id, topic.name.as_str());
         match topic.kind {
             TopicKind::ServiceRequest if is_shown => {

@@ -33,7 +33,7 @@ async fn list(State(context): State<Context>) -> Json<SnapshotList> {
         let SnapshotFigures {
             messages,
             bytes,
-            crowded_out,
+            evicted: crowded_out,
             written,
             failed,
             suppressed,

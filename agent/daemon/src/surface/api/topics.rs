@@ -15,7 +15,7 @@ use super::Context;
 use super::endpoint::{endpoint, printed, texts};
 use super::finding::diagnosis;
 use super::history;
-use super::index::{Index, Standing};
+use super::index::{Index, WatchedTopic};
 use super::inside;
 use super::measured::{breakdown, buckets, delivered, topic_measurement};
 use super::messages;
@@ -23,13 +23,13 @@ use super::nearest::hint;
 use super::parameters::{Name, Parameters};
 use super::past::{self, TopicRange};
 use super::problem::{Code, Problem, ProblemBody};
-use super::reasons::Circumstances;
+use super::reasons::ReasonInputs;
 use super::scope::{Domain, Scope, only};
-use super::security::Granted;
+use super::security::Rights;
 use super::watch::expectations;
 use crate::agent_facts::{Ability, SourceKind};
 use crate::snapshot_cell::State as AgentState;
-use crate::watches::InForce;
+use crate::watches::ActiveWatches;
 use ros2probe_api::endpoints::WriterClock;
 use ros2probe_api::topics::{
     self, Acknowledgement, Delivery, Topic, TopicDetails, TopicList, Watching,
@@ -62,11 +62,11 @@ async fn list(
     Parameters(scope): Parameters<Scope>,
 ) -> Result<Response, Problem> {
     let scope = scope.checked()?;
-    let (state, in_force) = (context.state().await, context.watches.in_force());
+    let (state, in_force) = (context.state().await, context.watches.active());
     let answers = TopicAnswers::new(&state, &in_force);
     let topics = answers.snapshot.topics.iter().filter(|topic| {
         let is_plain = matches!(topic.kind, TopicKind::Topic | TopicKind::Dds) && !topic.hidden;
-        scope.admits(topic.domain_id) && (is_plain || scope.shows_hidden())
+        scope.includes(topic.domain_id) && (is_plain || scope.shows_hidden())
     });
     let answer = TopicList {
         timestamp_seconds: answers.snapshot.time().seconds(),
@@ -94,7 +94,7 @@ async fn list(
 )]
 async fn show(
     State(context): State<Context>,
-    Extension(granted): Extension<Granted>,
+    Extension(granted): Extension<Rights>,
     uri: Uri,
     Name(name): Name,
 ) -> Result<Response, Problem> {
@@ -118,7 +118,7 @@ async fn show(
     }
     let Parameters(domain) = Parameters::<Domain>::of(&uri)?;
     let domain = domain.checked()?;
-    let (state, in_force) = (context.state().await, context.watches.in_force());
+    let (state, in_force) = (context.state().await, context.watches.active());
     let answers = TopicAnswers::new(&state, &in_force);
     let topic = find(answers.snapshot, &name, domain)?;
     Ok(Json(answers.details(topic)).into_response())
@@ -205,28 +205,28 @@ fn is_called(topic: &TopicFacts, name: &str) -> bool {
 
 /// Input of the answers.
 struct TopicAnswers<'a> {
-    in_force: &'a InForce,
+    in_force: &'a ActiveWatches,
     snapshot: &'a Snapshot,
     /// Whether uprobes observe every message to shared memory.
     is_exact: bool,
-    circumstances: Circumstances<'a>,
+    circumstances: ReasonInputs<'a>,
 }
 
 impl<'a> TopicAnswers<'a> {
-    fn new(state: &'a AgentState, in_force: &'a InForce) -> Self {
+    fn new(state: &'a AgentState, in_force: &'a ActiveWatches) -> Self {
         let snapshot = state.known();
         let abilities = &state.agent.abilities;
         Self {
             in_force,
             snapshot,
             is_exact: abilities.contains(&Ability::SharedMemoryExact),
-            circumstances: Circumstances {
+            circumstances: ReasonInputs {
                 snapshot,
                 index: Index::new(snapshot),
                 watchlist: in_force.watchlist(),
                 source: state.agent.source,
-                looks_at_memory: state.agent.shared_memory.is_some(),
-                lacks_inside: state.agent.source != SourceKind::Replay
+                samples_shared_memory: state.agent.shared_memory.is_some(),
+                misses_inside_calls: state.agent.source != SourceKind::Replay
                     && !abilities.contains(&Ability::Inside),
                 unready: state.ready(Instant::now()).err(),
             },
@@ -287,7 +287,7 @@ impl<'a> TopicAnswers<'a> {
     fn view(&self, facts: &TopicFacts) -> &'static str {
         if self.is_exact {
             "exact"
-        } else if !self.circumstances.looks_at_memory {
+        } else if !self.circumstances.samples_shared_memory {
             "none"
         } else if facts.is_read {
             "close"
@@ -311,7 +311,7 @@ impl<'a> TopicAnswers<'a> {
         }
     }
 
-    fn watching(&self, (watch, topic): Standing<'a>) -> Watching<'a> {
+    fn watching(&self, (watch, topic): WatchedTopic<'a>) -> Watching<'a> {
         let watch = &watch.watch;
         let entry = self
             .in_force

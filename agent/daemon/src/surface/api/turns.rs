@@ -20,7 +20,7 @@ pub(super) enum NoResult {
 ///
 /// # Errors
 /// Fails if the work takes too long, or if the agent stops.
-pub(super) async fn in_turn<T: Send + 'static>(
+pub(super) async fn run_blocking<T: Send + 'static>(
     turns: &'static Semaphore,
     within: Duration,
     work: impl FnOnce() -> T + Send + 'static,
@@ -43,14 +43,17 @@ mod tests {
     use super::*;
 
     #[tokio::test]
-    async fn work_that_hangs_keeps_its_turn() {
+    async fn hanging_work_keeps_its_permit() {
         static TURNS: Semaphore = Semaphore::const_new(1);
         let short = Duration::from_millis(20);
         let (end, ended) = channel::<()>();
-        let hanging = in_turn(&TURNS, short, move || ended.recv().is_err());
+        let hanging = run_blocking(&TURNS, short, move || ended.recv().is_err());
         assert_eq!(hanging.await, Err(NoResult::Late));
-        assert_eq!(in_turn(&TURNS, short, || 7).await, Err(NoResult::Late));
+        assert_eq!(run_blocking(&TURNS, short, || 7).await, Err(NoResult::Late));
         drop(end);
-        assert_eq!(in_turn(&TURNS, Duration::from_secs(60), || 7).await, Ok(7));
+        assert_eq!(
+            run_blocking(&TURNS, Duration::from_secs(60), || 7).await,
+            Ok(7)
+        );
     }
 }

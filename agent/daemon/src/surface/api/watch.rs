@@ -23,7 +23,7 @@ use super::problem::{Code, Problem, ProblemBody};
 use super::scope;
 use super::security::MAX_BODY;
 use crate::config::watch::{self, ExpectationValues, Watch, check_pattern, check_trace};
-use crate::watches::{self, Done, Entry, Refused};
+use crate::watches::{self, AddOutcome, Entry, Refused};
 use ros2probe_api::watches::{
     Expectations, Origin, Retain, TopicState, WatchList, WatchRequest, WatchState, WatchedTopic,
 };
@@ -65,7 +65,7 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
     responses((status = 200, description = "Watches of every origin.", body = WatchList))
 )]
 async fn list(State(context): State<Context>) -> Json<WatchList> {
-    let (state, in_force) = (context.state().await, context.watches.in_force());
+    let (state, in_force) = (context.state().await, context.watches.active());
     let snapshot = state.snapshot.as_deref();
     let is_kept = context.watches.is_kept();
     let watches = in_force
@@ -95,7 +95,7 @@ async fn show(
     Parameters(domain): Parameters<Domain>,
 ) -> Result<Json<answers::Watch>, Problem> {
     let domain = domain.checked()?;
-    let (state, in_force) = (context.state().await, context.watches.in_force());
+    let (state, in_force) = (context.state().await, context.watches.active());
     let entry = in_force.find(&topic, domain.domain_id);
     let entry = entry.ok_or_else(|| unknown(&topic, domain.domain_id))?;
     let is_kept = context.watches.is_kept();
@@ -254,11 +254,11 @@ fn watch(topic: String, domain: Domain, settings: WatchRequest) -> Result<Watch,
 fn answer(
     context: &Context,
     watch: &Watch,
-    done: Result<Done, Refused>,
+    done: Result<AddOutcome, Refused>,
 ) -> Result<Response, Problem> {
     let done =
         done.map_err(|refused| problem(&refused, &watch.pattern, watch.domain_id.map(|id| id.0)))?;
-    let in_force = context.watches.in_force();
+    let in_force = context.watches.active();
     // Another client may have removed the watch already.
     let entry = in_force
         .find(&watch.pattern, watch.domain_id.map(|id| id.0))
@@ -272,14 +272,14 @@ fn answer(
     let snapshot = state
         .snapshot
         .as_deref()
-        .filter(|_| done == Done::Unchanged);
+        .filter(|_| done == AddOutcome::Unchanged);
     let body = Json(view(&entry, snapshot, context.watches.is_kept()));
     Ok(match done {
-        Done::Added => {
+        AddOutcome::Added => {
             let location = location(watch);
             (StatusCode::CREATED, [(LOCATION, location)], body).into_response()
         }
-        Done::Replaced | Done::Unchanged => body.into_response(),
+        AddOutcome::Replaced | AddOutcome::Unchanged => body.into_response(),
     })
 }
 
@@ -298,7 +298,7 @@ fn problem(refused: &Refused, topic: &str, domain_id: Option<u32>) -> Problem {
         } => {
             format!("{topic} is listed in the configuration file: change it there and reload")
         }
-        Refused::DefinedElsewhere { by } => format!("{topic} is defined by {}", by.phrase()),
+        Refused::DefinedElsewhere { by } => format!("{topic} is defined by {}", by.in_sentence()),
         Refused::Different => {
             format!("{topic} is watched with other settings: PUT replaces them")
         }

@@ -35,7 +35,7 @@ const LONGEST_MS: f64 = 3_600_000.0;
 const LONGEST_S: f64 = 1e9;
 
 /// A cause with the thread that it names.
-type Named = (late::Stage, late::Cause, Option<other_thread::Culprit>);
+type Named = (late::Stage, late::Cause, Option<other_thread::ThreadLabel>);
 
 /// Query parameters that select late calls.
 #[derive(Clone, Debug, Default, Deserialize, IntoParams)]
@@ -48,8 +48,8 @@ struct Of {
     /// ROS name of a topic or node; by default all.
     name: Option<String>,
     /// Calls of these callbacks are late if they take or wait longer than this, until ten seconds
-    /// after the last request. Without it, the bound is `max_latency_ms` of the topic. Without that,
-    /// it is three times the 99th percentile of the callback's calls.
+    /// after the last request. Without it, the bound is `max_latency_ms` of the topic. Without
+    /// that, it is three times the 99th percentile of the callback's calls.
     #[param(minimum = 0, maximum = 3_600_000)]
     above_ms: Option<f64>,
     /// Only late calls of the last seconds; by default all that are known.
@@ -82,12 +82,14 @@ async fn show(
     let domain = Domain::of(of.domain_id).checked()?;
     let above = of
         .above_ms
-        .map(|above| within("above_ms", above, LONGEST_MS));
+        .map(|above| number_in_range("above_ms", above, LONGEST_MS));
     let above = above.transpose()?;
     let above = above.map(|above| Duration::from_secs_f64(above / 1e3));
-    let last = of.last_s.map(|last| within("last_s", last, LONGEST_S));
+    let last = of
+        .last_s
+        .map(|last| number_in_range("last_s", last, LONGEST_S));
     let last = last.transpose()?.map(Duration::from_secs_f64);
-    context.latest.want_late(of.name.as_deref(), above);
+    context.latest.request_late_calls(of.name.as_deref(), above);
     let state = context.state().await;
     let snapshot = state.known();
     let source = state.agent.inside.as_ref();
@@ -106,7 +108,7 @@ async fn show(
 }
 
 /// Returns a number from 0 to `largest`, or the problem of another one.
-fn within(name: &str, number: f64, largest: f64) -> Result<f64, Problem> {
+fn number_in_range(name: &str, number: f64, largest: f64) -> Result<f64, Problem> {
     match (0.0..=largest).contains(&number) {
         true => Ok(number),
         false => {
@@ -165,7 +167,7 @@ fn why<'a>(
             let mut shown = late_callback(callback, known, since, clock);
             if selection.has_history {
                 let calls = callback.history.iter().filter(|entry| entry.at >= since);
-                shown.history = calls.map(|entry| moment(entry, clock)).collect();
+                shown.history = calls.map(|entry| summary(entry, clock)).collect();
             }
             shown
         })
@@ -181,7 +183,7 @@ fn causes(callbacks: &[&facts::LateCallback], since: ModelTime) -> Vec<Cause<'st
     let mut sums: BTreeMap<Named, (u64, Duration)> = BTreeMap::new();
     for callback in callbacks {
         for entry in callback.history.iter().filter(|entry| entry.at >= since) {
-            let key = (entry.stage, entry.cause, entry.culprit.clone());
+            let key = (entry.stage, entry.cause, entry.other_thread.clone());
             let (calls, longest) = sums.entry(key).or_default();
             *calls += 1;
             *longest = (*longest).max(entry.total);
@@ -239,7 +241,7 @@ fn late_callback<'a>(
     }
 }
 
-fn moment(entry: &facts::LateEntry, clock: WallClock) -> LateCallSummary<'_> {
+fn summary(entry: &facts::LateEntry, clock: WallClock) -> LateCallSummary<'_> {
     LateCallSummary {
         timestamp_seconds: clock.wall_time(entry.at).seconds(),
         total_seconds: entry.total.as_secs_f64(),
@@ -247,7 +249,7 @@ fn moment(entry: &facts::LateEntry, clock: WallClock) -> LateCallSummary<'_> {
         cause: entry.cause.label().into(),
         words: entry
             .cause
-            .in_words(entry.culprit.as_ref().map(|by| by as _))
+            .in_words(entry.other_thread.as_ref().map(|by| by as _))
             .into(),
     }
 }

@@ -235,7 +235,7 @@ impl Registry {
     }
 
     fn channel(&self, id: u32, content: &Content, topic: &TopicFacts) -> Channel {
-        let name = self.names.shown(topic.domain_id, &topic.name);
+        let name = self.names.display_name(topic.domain_id, &topic.name);
         let (topic, schema) = match content {
             Content::Messages { .. } => {
                 let definition = definition(content, topic);
@@ -247,7 +247,7 @@ impl Registry {
                     encoding: "jsonschema",
                     text: statistics::schema(),
                 };
-                (format!("{}{name}", statistics::PREFIX), Some(schema))
+                (format!("{}{name}", statistics::TOPIC_PREFIX), Some(schema))
             }
         };
         Channel {

@@ -39,29 +39,29 @@ const MAX_MESSAGE: usize = 256 << 10;
 /// Capacity of a client's queue in bytes; `limits.payload_bytes` bounds all queues together.
 const QUEUE_BYTES: usize = 16 << 20;
 /// Size of a fragment of a message to a client, and of an `advertise` message, in bytes.
-const FRAGMENT: usize = 64 << 10;
+const FRAGMENT_BYTES: usize = 64 << 10;
 /// Maximum number of messages sent before the agent reads from the client again.
-const BATCH: usize = 64;
+const MAX_BATCH: usize = 64;
 /// Interval of statuses, and number of intervals between two pings.
-const TICK: Duration = Duration::from_secs(1);
+const STATUS_INTERVAL: Duration = Duration::from_secs(1);
 const PING_TICKS: u32 = 20;
 /// Number of unanswered pings after which a client counts as gone.
 const MAX_UNANSWERED: u32 = 3;
 /// Seconds without a loss after which the status of losses is removed.
-const QUIET_TICKS: u32 = 10;
+const LOSS_END_TICKS: u32 = 10;
 /// Maximum number of topics that a status names.
-const NAMED: usize = 3;
+const MAX_NAMED_TOPICS: usize = 3;
 
 /// Silence of a topic after which a status reports the missing subscriber.
-const SILENT: Duration = Duration::from_secs(5);
+const SILENCE_TIMEOUT: Duration = Duration::from_secs(5);
 /// Id of the status that names topics without a subscriber.
 const NO_SUBSCRIBER: &str = "no_subscriber";
 
 /// Maximum time for a client to read why its connection is closed.
-const FAREWELL: Duration = Duration::from_secs(1);
+const CLOSE_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Losses that a status reports to the client.
-const LOSSES: [(MissedReason, &str, &str); 2] = [
+const REPORTED_LOSSES: [(MissedReason, &str, &str); 2] = [
     (
         MissedReason::QueueFull,
         "queue_full",
@@ -88,7 +88,7 @@ pub(super) struct Client<S> {
     /// Messages of all subscribed topics.
     messages: Option<Subscription>,
     graph: Option<Arc<Graph>>,
-    losses: [Losses; LOSSES.len()],
+    losses: [Losses; REPORTED_LOSSES.len()],
     /// The last status about topics without a subscriber; empty without such topics.
     unsubscribed: String,
     unanswered: u32,
@@ -100,7 +100,7 @@ struct Subscribed {
     previous: Previous,
     since: Instant,
     /// Whether a message of the subscription was sent.
-    is_heard: bool,
+    has_sent: bool,
 }
 
 /// Messages lost for one reason, since the status of that reason was last removed.
@@ -142,7 +142,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
     ) -> Self {
         let config = WebSocketConfig::default()
             .read_buffer_size(4 << 10)
-            .write_buffer_size(FRAGMENT)
+            .write_buffer_size(FRAGMENT_BYTES)
             .max_message_size(Some(MAX_MESSAGE))
             .max_frame_size(Some(MAX_MESSAGE));
         let socket = WebSocketStream::from_raw_socket(stream, Role::Server, Some(config)).await;
@@ -177,12 +177,12 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
             tracing::debug!(%code, reason, "closed a viewer");
             // Dropping the subscription ends the interest in its topics first.
             self.messages = None;
-            let _ = timeout(FAREWELL, self.say_farewell(code, reason)).await;
+            let _ = timeout(CLOSE_TIMEOUT, self.close_with_reason(code, reason)).await;
         }
     }
 
     async fn serve(&mut self) -> Result<(), End> {
-        self.introduce().await?;
+        self.send_server_info().await?;
         let mut ticks = ticks();
         let mut count = 0_u32;
         loop {
@@ -194,7 +194,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
                 },
                 changed = self.tables.changed() => {
                     changed.map_err(|_| End::Gone)?;
-                    self.show().await?;
+                    self.send_changes().await?;
                 }
                 _ = ticks.tick() => {
                     count = count.wrapping_add(1);
@@ -206,8 +206,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
                 }
                 item = next(&mut self.messages) => {
                     let mut item = item;
-                    for _ in 0..BATCH {
-                        self.pass(item).await?;
+                    for _ in 0..MAX_BATCH {
+                        self.send_item(item).await?;
                         match self.messages.as_mut().and_then(Subscription::try_next) {
                             Some(next) => item = Some(next),
                             None => break,
@@ -220,7 +220,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
     }
 
     /// Sends the description of the server.
-    async fn introduce(&mut self) -> Result<(), End> {
+    async fn send_server_info(&mut self) -> Result<(), End> {
         let shared = Arc::clone(&self.shared);
         let capabilities: &[_] = match shared.is_replay {
             true => &["connectionGraph", "time"],
@@ -263,7 +263,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
                 Ok(())
             }
             Ok(Request::UnsubscribeGraph) => {
-                self.leave_graph();
+                self.unsubscribe_graph();
                 Ok(())
             }
             Ok(Request::Unsupported(op)) => self.unsupported(&format!("`{op}`")).await,
@@ -306,7 +306,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
                 channel: Arc::clone(channel),
                 previous: Previous::default(),
                 since: Instant::now(),
-                is_heard: false,
+                has_sent: false,
             };
             self.subscribed.insert(*id, subscribed);
             fresh.extend(content.messages_of());
@@ -392,7 +392,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
     }
 
     /// Sends the changes of the channels and the graph, and the statistics.
-    async fn show(&mut self) -> Result<(), End> {
+    async fn send_changes(&mut self) -> Result<(), End> {
         let table = self.tables.borrow_and_update().clone();
         let Some(table) = table else {
             return Ok(());
@@ -420,7 +420,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
             self.ids.retain(|_, id| self.subscribed.contains_key(id));
             self.select(BTreeSet::new()).await?;
             self.viewer.set_subscriptions(self.subscribed.len());
-            for channel_ids in gone.chunks(FRAGMENT / 16) {
+            for channel_ids in gone.chunks(FRAGMENT_BYTES / 16) {
                 self.send(&Message::Unadvertise { channel_ids }).await?;
             }
         }
@@ -429,7 +429,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
         for (_, channel) in new {
             some.push(channel.advertised());
             size += channel.size();
-            if size >= FRAGMENT {
+            if size >= FRAGMENT_BYTES {
                 let channels = std::mem::take(&mut some);
                 self.send(&Message::Advertise {
                     channels: &channels,
@@ -472,9 +472,9 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
     }
 
     /// Sends an item of the subscription to the client, or counts its losses.
-    async fn pass(&mut self, item: Option<Item>) -> Result<(), End> {
+    async fn send_item(&mut self, item: Option<Item>) -> Result<(), End> {
         match item {
-            Some(Item::Sample(sample)) => self.pass_sample(&sample).await,
+            Some(Item::Sample(sample)) => self.send_sample(&sample).await,
             Some(Item::Missed(missed)) => {
                 self.count(&missed);
                 Ok(())
@@ -496,13 +496,13 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
         }
     }
 
-    async fn pass_sample(&mut self, sample: &Sample) -> Result<(), End> {
+    async fn send_sample(&mut self, sample: &Sample) -> Result<(), End> {
         let id = self.ids.get(&Content::of(&sample.topic));
         match (id, &sample.payload) {
             (Some(id), Some(payload)) => {
                 let id = *id;
                 if let Some(subscribed) = self.subscribed.get_mut(&id) {
-                    subscribed.is_heard = true;
+                    subscribed.has_sent = true;
                 }
                 self.send_data(id, sample.time, payload).await
             }
@@ -520,7 +520,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
         if missed.reason == MissedReason::QueueFull {
             self.viewer.dropped(missed.samples);
         }
-        let mut losses = LOSSES.iter().zip(&mut self.losses);
+        let mut losses = REPORTED_LOSSES.iter().zip(&mut self.losses);
         let losses = losses.find(|((reason, ..), _)| *reason == missed.reason);
         if let Some((_, losses)) = losses {
             losses.add(subscribed.channel.topic(), missed.samples);
@@ -529,7 +529,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
 
     /// Reports new losses, and removes the status of old losses.
     async fn report_losses(&mut self) -> Result<(), End> {
-        for (place, (_, id, what)) in LOSSES.iter().enumerate() {
+        for (place, (_, id, what)) in REPORTED_LOSSES.iter().enumerate() {
             let Some(losses) = self.losses.get_mut(place) else {
                 continue;
             };
@@ -540,7 +540,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
                 losses.quiet = 0;
                 let message = losses.text(what);
                 self.status(Level::Warning, id, &message).await?;
-            } else if losses.quiet < QUIET_TICKS {
+            } else if losses.quiet < LOSS_END_TICKS {
                 losses.quiet += 1;
             } else {
                 *losses = Losses::default();
@@ -570,7 +570,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
     /// topics.
     fn unsubscribed_now(&self) -> String {
         let silent = self.subscribed.values().filter_map(|subscribed| {
-            let is_silent = !subscribed.is_heard && subscribed.since.elapsed() >= SILENT;
+            let is_silent = !subscribed.has_sent && subscribed.since.elapsed() >= SILENCE_TIMEOUT;
             let key = subscribed.channel.content.messages_of()?;
             is_silent.then(|| (key, subscribed.channel.topic()))
         });
@@ -585,8 +585,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
             topic.is_unsubscribed().then_some(*name)
         });
         let names: Vec<&str> = names.collect();
-        let named = names.get(..NAMED).unwrap_or(&names).join(", ");
-        match (names.len(), names.len().saturating_sub(NAMED)) {
+        let named = names.get(..MAX_NAMED_TOPICS).unwrap_or(&names).join(", ");
+        match (names.len(), names.len().saturating_sub(MAX_NAMED_TOPICS)) {
             (0, _) => String::new(),
             (_, 0) => format!("{named}: {UNSUBSCRIBED}"),
             (_, more) => format!("{named} and {more} more: {UNSUBSCRIBED}"),
@@ -602,7 +602,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
         Ok(())
     }
 
-    fn leave_graph(&mut self) {
+    fn unsubscribe_graph(&mut self) {
         if self.graph.take().is_some() {
             self.shared.change_graphs(-1);
         }
@@ -632,7 +632,7 @@ impl Losses {
     fn text(&self, what: &str) -> String {
         let mut topics: Vec<_> = self.topics.iter().collect();
         topics.sort_by_key(|(_, messages)| std::cmp::Reverse(**messages));
-        let named = topics.iter().take(NAMED);
+        let named = topics.iter().take(MAX_NAMED_TOPICS);
         let named: Vec<_> = named
             .map(|(name, messages)| format!("{messages} of {name}"))
             .collect();
@@ -650,7 +650,7 @@ async fn next(messages: &mut Option<Subscription>) -> Option<Item> {
 }
 
 fn ticks() -> Interval {
-    let mut ticks = interval(TICK);
+    let mut ticks = interval(STATUS_INTERVAL);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     ticks
 }

@@ -134,7 +134,7 @@ impl Viewers {
     }
 
     /// Counts a refused handshake.
-    pub(super) fn refuse(&self) {
+    pub(super) fn count_refusal(&self) {
         self.refused.fetch_add(1, Ordering::Relaxed);
     }
 

@@ -28,13 +28,13 @@ impl Graph {
                 kind if kind.is_ros_topic() => (&mut graph.published, &mut graph.subscribed),
                 // A server reads requests.
                 TopicKind::ServiceRequest => {
-                    let name = names.shown(topic.domain_id, &topic.name);
+                    let name = names.display_name(topic.domain_id, &topic.name);
                     add(&mut graph.services, name, &topic.subscriptions);
                     continue;
                 }
                 _ => continue,
             };
-            let name = names.shown(topic.domain_id, &topic.name);
+            let name = names.display_name(topic.domain_id, &topic.name);
             add(writers, name.clone(), &topic.publishers);
             add(readers, name, &topic.subscriptions);
         }

@@ -14,7 +14,7 @@ use tokio_tungstenite::tungstenite::handshake::derive_accept_key;
 use super::protocol::SUBPROTOCOLS;
 
 /// Version of the WebSocket protocol.
-const VERSION: &str = "13";
+const WEBSOCKET_VERSION: &str = "13";
 
 /// Query of the URL. Viewers can choose only the URL and the subprotocols.
 #[derive(Default, Deserialize)]
@@ -24,7 +24,7 @@ struct Parameters {
 
 /// Why a handshake fails.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Unfit {
+pub(super) enum HandshakeError {
     /// The request does not open a WebSocket.
     NoWebSocket,
     /// The client offers none of the supported subprotocols.
@@ -42,7 +42,7 @@ pub(super) async fn token(request: Request) -> (Option<String>, Request) {
 }
 
 /// Returns the answer that accepts a handshake.
-pub(super) fn accept(request: &Request) -> Result<Response, Unfit> {
+pub(super) fn accept(request: &Request) -> Result<Response, HandshakeError> {
     let headers = request.headers();
     let has = |name: HeaderName, word: &str| {
         words(headers, &name).any(|each| each.eq_ignore_ascii_case(word))
@@ -51,11 +51,13 @@ pub(super) fn accept(request: &Request) -> Result<Response, Unfit> {
     let is_websocket = request.method() == Method::GET
         && has(CONNECTION, "upgrade")
         && has(UPGRADE, "websocket")
-        && has(SEC_WEBSOCKET_VERSION, VERSION);
-    let key = key.filter(|_| is_websocket).ok_or(Unfit::NoWebSocket)?;
+        && has(SEC_WEBSOCKET_VERSION, WEBSOCKET_VERSION);
+    let key = key
+        .filter(|_| is_websocket)
+        .ok_or(HandshakeError::NoWebSocket)?;
     let mut offered = words(headers, &SEC_WEBSOCKET_PROTOCOL);
     let spoken = offered.find_map(|offered| SUBPROTOCOLS.into_iter().find(|ours| *ours == offered));
-    let spoken = spoken.ok_or(Unfit::Subprotocol)?;
+    let spoken = spoken.ok_or(HandshakeError::Subprotocol)?;
     let mut response = StatusCode::SWITCHING_PROTOCOLS.into_response();
     let accepted = HeaderValue::try_from(derive_accept_key(key.as_bytes()));
     let headers = response.headers_mut();
@@ -64,7 +66,7 @@ pub(super) fn accept(request: &Request) -> Result<Response, Unfit> {
     headers.insert(SEC_WEBSOCKET_PROTOCOL, HeaderValue::from_static(spoken));
     headers.insert(
         SEC_WEBSOCKET_ACCEPT,
-        accepted.map_err(|_| Unfit::NoWebSocket)?,
+        accepted.map_err(|_| HandshakeError::NoWebSocket)?,
     );
     Ok(response)
 }
@@ -76,7 +78,7 @@ fn words<'a>(headers: &'a HeaderMap, name: &HeaderName) -> impl Iterator<Item = 
     lines.flat_map(|line| line.split(',')).map(str::trim)
 }
 
-impl IntoResponse for Unfit {
+impl IntoResponse for HandshakeError {
     fn into_response(self) -> Response {
         let close = (CONNECTION, HeaderValue::from_static("close"));
         match self {
@@ -84,7 +86,10 @@ impl IntoResponse for Unfit {
                 let headers = [
                     close,
                     (UPGRADE, HeaderValue::from_static("websocket")),
-                    (SEC_WEBSOCKET_VERSION, HeaderValue::from_static(VERSION)),
+                    (
+                        SEC_WEBSOCKET_VERSION,
+                        HeaderValue::from_static(WEBSOCKET_VERSION),
+                    ),
                 ];
                 let text = "This port speaks the Foxglove WebSocket protocol. Open its address, \
                             with ws:// in front, in Foxglove, Lichtblick or PlotJuggler.\n";
@@ -153,15 +158,15 @@ mod tests {
             (SEC_WEBSOCKET_KEY, ""),
         ] {
             let unfit = accept(&request(&[(name.clone(), value)])).unwrap_err();
-            assert_eq!(unfit, Unfit::NoWebSocket, "{name} {value}");
+            assert_eq!(unfit, HandshakeError::NoWebSocket, "{name} {value}");
         }
         for value in ["", "rosbridge", "Foxglove.sdk.v1", "foxglove.sdk.v2"] {
             let unfit = accept(&request(&[(SEC_WEBSOCKET_PROTOCOL, value)])).unwrap_err();
-            assert_eq!(unfit, Unfit::Subprotocol, "{value}");
+            assert_eq!(unfit, HandshakeError::Subprotocol, "{value}");
         }
         let mut post = request(&[]);
         *post.method_mut() = Method::POST;
-        assert_eq!(accept(&post).unwrap_err(), Unfit::NoWebSocket);
+        assert_eq!(accept(&post).unwrap_err(), HandshakeError::NoWebSocket);
     }
 
     #[tokio::test]

@@ -36,7 +36,7 @@ use tokio_util::task::TaskTracker;
 use super::api;
 use super::api::page::Page;
 use super::api::problem::{Code, Problem};
-use super::api::security::{Door, Granted, Kind, Token, TokenError};
+use super::api::security::{AccessRules, Kind, Rights, Token, TokenError};
 use super::connection::{Connection, ConnectionState};
 use super::limited_listener::{LimitedListener, Refusal};
 use super::listen::listen;
@@ -83,9 +83,9 @@ struct Shared {
 
 /// State of the listener.
 #[derive(Clone)]
-struct Gate {
+struct ListenerState {
     shared: Arc<Shared>,
-    door: Arc<Door>,
+    access_rules: Arc<AccessRules>,
     origins: Arc<[String]>,
     places: Arc<Places>,
     tasks: TaskTracker,
@@ -155,12 +155,12 @@ impl Server {
             Some(token) if !is_local => Kind::Network(token),
             token => Kind::Loopback(token),
         };
-        let granted = Granted::new(kind.access(self.loopback), None);
-        let door = Door::new(kind, granted).with(Arc::<Page>::clone(&context.page));
+        let granted = Rights::new(kind.access(self.loopback), None);
+        let door = AccessRules::new(kind, granted).with(Arc::<Page>::clone(&context.page));
         let shared = Arc::new(Shared::new(&context));
-        let gate = Gate {
+        let gate = ListenerState {
             shared: Arc::clone(&shared),
-            door: Arc::new(door),
+            access_rules: Arc::new(door),
             origins: self.origins,
             places: Arc::new(Places::new(
                 context.limits.caps().get(Limit::FoxgloveClients),
@@ -170,7 +170,7 @@ impl Server {
         let tasks = gate.tasks.clone();
         let router = Router::new().fallback(open).with_state(gate);
         let listener = tokio::net::TcpListener::from_std(self.listener)?;
-        let full = full(&context.limits);
+        let full = too_many_viewers(&context.limits);
         let limits = Arc::clone(&context.limits);
         let listener = LimitedListener::new(listener, limits, Limit::FoxgloveClients, Some(full));
         let place = |connection: &Connection<tokio::net::TcpStream>| Place {
@@ -246,33 +246,33 @@ async fn follow(shared: Arc<Shared>, library: Arc<Library>) {
 }
 
 /// Opens a WebSocket, or refuses the request with a reason.
-async fn open(State(gate): State<Gate>, request: Request) -> Response {
+async fn open(State(gate): State<ListenerState>, request: Request) -> Response {
     let place = request.extensions().get::<Place>().cloned();
     let (token, mut request) = handshake::token(request).await;
     let refused = |response: Response| {
-        gate.shared.viewers.refuse();
+        gate.shared.viewers.count_refusal();
         response
     };
     let offered = token.as_deref().map(str::as_bytes);
     let granted =
-        gate.door
-            .let_in_viewer(request.headers(), offered, &gate.origins, Instant::now());
+        gate.access_rules
+            .check_viewer(request.headers(), offered, &gate.origins, Instant::now());
     let granted = match granted {
         Ok(granted) => granted,
-        Err(problem) => return refused(turned_away(problem)),
+        Err(problem) => return refused(refusal(problem)),
     };
     let response = match handshake::accept(&request) {
         Ok(response) => response,
         Err(unfit) => return refused(unfit.into_response()),
     };
-    let Some(taken) = gate.places.take(granted.is_holder()) else {
+    let Some(taken) = gate.places.take(granted.has_token()) else {
         let detail = "all places for viewers without a token are taken, a quarter of \
                       limits.foxglove_clients is for others: add `?token=TOKEN` to the address, as \
                       `rp foxglove` prints it";
-        return refused(turned_away(Problem::new(Code::TooManyClients, detail)));
+        return refused(refusal(Problem::new(Code::TooManyClients, detail)));
     };
     let upgrade = hyper::upgrade::on(&mut request);
-    let Gate { shared, tasks, .. } = gate;
+    let ListenerState { shared, tasks, .. } = gate;
     tasks.spawn(async move {
         let _taken = taken;
         let Ok(stream) = upgrade.await else {
@@ -281,7 +281,7 @@ async fn open(State(gate): State<Gate>, request: Request) -> Response {
         let address = place.as_ref().and_then(|place| place.address);
         if let Some(place) = place {
             // A viewer need not send data while it reads.
-            place.state.answers(false);
+            place.state.begin_answer(false);
         }
         let access = granted.access();
         let viewer = shared.viewers.join(address, access);
@@ -291,13 +291,13 @@ async fn open(State(gate): State<Gate>, request: Request) -> Response {
     response
 }
 
-fn turned_away(problem: Problem) -> Response {
+fn refusal(problem: Problem) -> Response {
     let close = [(CONNECTION, HeaderValue::from_static("close"))];
     (close, problem).into_response()
 }
 
 /// Returns the answer to a viewer beyond the limit of connections.
-fn full(limits: &LimitFigures) -> Refusal {
+fn too_many_viewers(limits: &LimitFigures) -> Refusal {
     let most = limits.caps().get(Limit::FoxgloveClients);
     let text =
         format!("{most} viewers are connected, which is the limit (limits.foxglove_clients)\n");

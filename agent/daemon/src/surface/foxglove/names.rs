@@ -26,7 +26,7 @@ impl DomainNames {
     }
 
     /// Returns the name that viewers show.
-    pub(super) fn shown(&self, domain_id: DomainId, name: &TopicName) -> String {
+    pub(super) fn display_name(&self, domain_id: DomainId, name: &TopicName) -> String {
         match self.0.get(name) {
             Some(owner) if *owner != domain_id => format!("/domain_{domain_id}{name}"),
             _ => name.to_string(),

@@ -13,11 +13,11 @@ use serde::{Deserialize, Serialize};
 pub(super) const SUBPROTOCOLS: [&str; 2] = ["foxglove.sdk.v1", "foxglove.websocket.v1"];
 /// Opcodes of binary messages to the client.
 const MESSAGE_DATA: u8 = 1;
-const TIME: u8 = 2;
+const TIME_OPCODE: u8 = 2;
 /// Size of the part of a data message before the payload, in bytes.
 pub(super) const DATA_HEAD: usize = 13;
 /// Maximum number of characters of an unknown `op` that a status repeats.
-const SHOWN: usize = 32;
+const MAX_SHOWN_OP: usize = 32;
 
 /// A message of a client.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -176,7 +176,9 @@ pub fn parse(text: &str) -> Result<Request, Malformed> {
             .map_err(|_| Malformed),
         "subscribeConnectionGraph" => Ok(Request::SubscribeGraph),
         "unsubscribeConnectionGraph" => Ok(Request::UnsubscribeGraph),
-        other => Ok(Request::Unsupported(other.chars().take(SHOWN).collect())),
+        other => Ok(Request::Unsupported(
+            other.chars().take(MAX_SHOWN_OP).collect(),
+        )),
     }
 }
 
@@ -195,7 +197,7 @@ pub(super) fn data_head(subscription: u32, time: Timestamp) -> [u8; DATA_HEAD] {
 
 /// Returns a message with the time of the server.
 pub(super) fn time(now: Timestamp) -> Vec<u8> {
-    let mut message = vec![TIME];
+    let mut message = vec![TIME_OPCODE];
     message.extend(now.0.to_le_bytes());
     message
 }
@@ -223,7 +225,10 @@ mod tests {
             assert_eq!(parse(&format!(r#"{{"op":"{op}","id":"x"}}"#)), Ok(expected));
         }
         let long = format!(r#"{{"op":"{}"}}"#, "é".repeat(1_000));
-        assert_eq!(parse(&long), Ok(Request::Unsupported("é".repeat(SHOWN))));
+        assert_eq!(
+            parse(&long),
+            Ok(Request::Unsupported("é".repeat(MAX_SHOWN_OP)))
+        );
     }
 
     #[test]

@@ -10,7 +10,7 @@ use serde_json::{Map, Value, json};
 /// Name of the schema.
 pub(super) const SCHEMA_NAME: &str = "ros2probe/TopicStatistics";
 /// Prefix of the channels' topics.
-pub(super) const PREFIX: &str = "/rp/topics";
+pub(super) const TOPIC_PREFIX: &str = "/rp/topics";
 
 /// Times of a topic's messages.
 #[derive(Clone, Copy, Debug)]

@@ -224,7 +224,7 @@ impl Elements<'_> {
                     }
                     continue;
                 }
-                Event::Decl(_) if self.reader.buffer_position() <= DECLARATION => continue,
+                Event::Decl(_) if self.reader.buffer_position() <= MAX_DECLARATION => continue,
                 _ => return Err(Malformed::Xml),
             };
             return Ok((text, tag));
@@ -233,7 +233,7 @@ impl Elements<'_> {
 }
 
 /// Maximum position of the end of the XML declaration, in bytes.
-const DECLARATION: u64 = 100;
+const MAX_DECLARATION: u64 = 100;
 
 #[cfg(test)]
 mod tests {

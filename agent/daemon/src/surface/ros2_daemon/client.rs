@@ -118,7 +118,7 @@ mod tests {
 
     /// Returns the distribution that follows from a process, a setting, a User-Agent and the
     /// robot's hashes.
-    fn chosen(
+    fn chosen_dialect(
         process: Option<Dialect>,
         configured: Option<Dialect>,
         user_agent: Option<&str>,
@@ -149,7 +149,7 @@ mod tests {
         use Dialect::{Humble, Jazzy, Kilted, Rolling};
         let hash: &[TypeHash] = &[TypeHash([1; 32])];
         let python = |release| Some(release);
-        let all = chosen(
+        let all = chosen_dialect(
             Some(Kilted),
             Some(Rolling),
             python("Python-xmlrpc/3.10"),
@@ -157,7 +157,7 @@ mod tests {
         );
         assert_eq!(all, Kilted);
         assert_eq!(
-            chosen(None, Some(Rolling), python("Python-xmlrpc/3.10"), hash),
+            chosen_dialect(None, Some(Rolling), python("Python-xmlrpc/3.10"), hash),
             Rolling
         );
         for (agent, expected) in [
@@ -168,10 +168,14 @@ mod tests {
             ("Python-xmlrpc/3.11", Jazzy),
             ("curl/8", Jazzy),
         ] {
-            assert_eq!(chosen(None, None, python(agent), hash), expected, "{agent}");
+            assert_eq!(
+                chosen_dialect(None, None, python(agent), hash),
+                expected,
+                "{agent}"
+            );
         }
         assert_eq!(
-            chosen(None, None, python("Python-xmlrpc/3.11"), &[]),
+            chosen_dialect(None, None, python("Python-xmlrpc/3.11"), &[]),
             Humble
         );
         assert_eq!(announced(&Snapshot::default(), DomainId(0)), None);

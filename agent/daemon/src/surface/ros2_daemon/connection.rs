@@ -20,7 +20,7 @@ use crate::tables::Ros2DaemonClients;
 use ros2probe_model::facts::bounded::Bounded;
 
 /// Maximum time from an answer to the end of the next request and its answer.
-pub(super) const IDLE: Duration = Duration::from_secs(10);
+pub(super) const IDLE_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// The stream of a connection.
 #[derive(Debug)]
@@ -83,15 +83,16 @@ impl ConnectionState {
         self.resets.store(true, Ordering::Relaxed);
     }
 
-    /// Waits until the connection must end: on request, or after [`IDLE`] without an answer.
+    /// Waits until the connection must end: on request, or after [`IDLE_TIMEOUT`] without an
+    /// answer.
     pub(super) async fn ended(&self) {
         loop {
-            let deadline = self.since() + IDLE;
+            let deadline = self.since() + IDLE_TIMEOUT;
             tokio::select! {
                 () = self.end.cancelled() => return,
                 () = sleep_until(deadline) => {}
             }
-            if self.since() + IDLE <= Instant::now() {
+            if self.since() + IDLE_TIMEOUT <= Instant::now() {
                 return;
             }
         }
@@ -211,7 +212,7 @@ mod tests {
     async fn a_connection_ends_ten_seconds_after_its_last_answer() {
         let state = state();
         let start = Instant::now();
-        tokio::time::advance(IDLE / 2).await;
+        tokio::time::advance(IDLE_TIMEOUT / 2).await;
         state.requested();
         state.answered();
         state.ended().await;

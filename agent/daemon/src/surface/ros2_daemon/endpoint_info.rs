@@ -16,9 +16,9 @@ use super::value::Value;
 const LONG_GID: usize = 24;
 /// Namespace and name that rmw returns for an endpoint whose participant has not announced its
 /// nodes yet.
-const UNKNOWN: (&str, &str) = ("_NODE_NAMESPACE_UNKNOWN_", "_NODE_NAME_UNKNOWN_");
+const UNKNOWN_NODE: (&str, &str) = ("_NODE_NAMESPACE_UNKNOWN_", "_NODE_NAME_UNKNOWN_");
 /// Namespace and name that rmw returns for an endpoint of a participant without ROS.
-const BARE: (&str, &str) = ("_CREATED_BY_BARE_DDS_APP_", "_CREATED_BY_BARE_DDS_APP_");
+const BARE_DDS_NODE: (&str, &str) = ("_CREATED_BY_BARE_DDS_APP_", "_CREATED_BY_BARE_DDS_APP_");
 
 /// rclpy's `EndpointTypeEnum`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -116,8 +116,8 @@ impl Classes<'_> {
     fn node(self, endpoint: &EndpointFacts) -> (&str, &str) {
         match (&endpoint.node, self.graph.enclave(endpoint.guid.prefix)) {
             (Some(node), _) => parts(node),
-            (None, Some(_)) => UNKNOWN,
-            (None, None) => BARE,
+            (None, Some(_)) => UNKNOWN_NODE,
+            (None, None) => BARE_DDS_NODE,
         }
     }
 

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
-use super::function::{ALL, FUNCTIONS, Function, UNKNOWN};
+use super::function::{ALL, FUNCTION_COUNT, Function, UNKNOWN_LABEL};
 
 /// Port of domain 0.
 pub const BASE_PORT: u16 = 11_511;
@@ -15,7 +15,7 @@ pub struct Ros2DaemonFigures {
     ports: Mutex<BTreeMap<u32, PortState>>,
     /// Number of requests by function, in the order of [`ALL`]. The last number counts requests for
     /// other functions.
-    requests: [AtomicU64; FUNCTIONS + 1],
+    requests: [AtomicU64; FUNCTION_COUNT + 1],
     refused: [AtomicU64; Refused::ALL.len()],
     clients: AtomicUsize,
 }
@@ -119,7 +119,10 @@ impl Ros2DaemonFigures {
 
     /// Returns the number of requests by function.
     pub fn requests(&self) -> impl Iterator<Item = (&'static str, u64)> {
-        let names = ALL.iter().map(|function| function.name).chain([UNKNOWN]);
+        let names = ALL
+            .iter()
+            .map(|function| function.name)
+            .chain([UNKNOWN_LABEL]);
         names
             .zip(&self.requests)
             .map(|(name, count)| (name, count.load(Ordering::Relaxed)))
@@ -139,14 +142,14 @@ impl Ros2DaemonFigures {
 
     /// Counts a request.
     pub(super) fn request(&self, method: &str) {
-        let index = Function::index(method).unwrap_or(FUNCTIONS);
+        let index = Function::index(method).unwrap_or(FUNCTION_COUNT);
         if let Some(count) = self.requests.get(index) {
             count.fetch_add(1, Ordering::Relaxed);
         }
     }
 
     /// Counts a refusal.
-    pub(super) fn refuse(&self, reason: Refused) {
+    pub(super) fn count_refusal(&self, reason: Refused) {
         if let Some(count) = self.refused.get(reason as usize) {
             count.fetch_add(1, Ordering::Relaxed);
         }

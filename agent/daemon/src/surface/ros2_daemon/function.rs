@@ -14,9 +14,9 @@ use super::value::{Fault, Value};
 /// Maximum number of endpoints in one answer; each endpoint takes 3 KB.
 pub(super) const MAX_ENDPOINTS: usize = 1024;
 /// Number of functions.
-pub(super) const FUNCTIONS: usize = 30;
+pub(super) const FUNCTION_COUNT: usize = 30;
 /// Label of requests for other functions.
-pub(super) const UNKNOWN: &str = "unknown";
+pub(super) const UNKNOWN_LABEL: &str = "unknown";
 
 /// Facts about a client, determined only if an answer depends on them.
 pub(super) trait Caller {
@@ -93,7 +93,7 @@ impl Function {
             return Err(self.missing(self.parameters.get(given..).unwrap_or_default()));
         }
         if given > most {
-            return Err(self.too_many(least, most, given));
+            return Err(self.too_many_arguments(least, most, given));
         }
         if let Some(Argument::Boolean(true)) = call.arguments.get(least) {
             let flag = self.flag.unwrap_or_default();
@@ -122,7 +122,7 @@ impl Function {
     }
 
     /// Returns Python's exception for too many arguments, which counts `self`.
-    fn too_many(&self, least: usize, most: usize, given: usize) -> Fault {
+    fn too_many_arguments(&self, least: usize, most: usize, given: usize) -> Fault {
         let mut takes = String::new();
         let _ = match least == most {
             true => write!(takes, "{}", most + 1),
@@ -153,28 +153,28 @@ pub(super) fn answer(call: &Call, query: &Query<'_>) -> Result<Value, Fault> {
     (function.answer)(query, &arguments)
 }
 
-const NODE: &[&str] = &["node_name", "node_namespace"];
-const TOPIC: &[&str] = &["topic_name"];
-const SERVICE: &[&str] = &["service_name"];
-const ACTION: &[&str] = &["action_name"];
+const NODE_ARGUMENTS: &[&str] = &["node_name", "node_namespace"];
+const TOPIC_ARGUMENTS: &[&str] = &["topic_name"];
+const SERVICE_ARGUMENTS: &[&str] = &["service_name"];
+const ACTION_ARGUMENTS: &[&str] = &["action_name"];
 
 /// All functions, sorted by name as `system.listMethods` returns them.
-pub(super) const ALL: [Function; FUNCTIONS] = [
+pub(super) const ALL: [Function; FUNCTION_COUNT] = [
     function(
         "count_action_clients",
-        ACTION,
+        ACTION_ARGUMENTS,
         "Return the number of clients of an action.",
         |query, arguments| Ok(Value::count(query.action(arguments, Side::Client)?.len())),
     ),
     function(
         "count_action_servers",
-        ACTION,
+        ACTION_ARGUMENTS,
         "Return the number of servers of an action.",
         |query, arguments| Ok(Value::count(query.action(arguments, Side::Server)?.len())),
     ),
     function(
         "count_clients",
-        SERVICE,
+        SERVICE_ARGUMENTS,
         "Return the number of clients of a service.",
         |query, arguments| {
             let name = full_name(arguments, "service")?;
@@ -183,7 +183,7 @@ pub(super) const ALL: [Function; FUNCTIONS] = [
     ),
     function(
         "count_publishers",
-        TOPIC,
+        TOPIC_ARGUMENTS,
         "Return the number of publishers on a topic.",
         |query, arguments| {
             Ok(Value::count(
@@ -193,7 +193,7 @@ pub(super) const ALL: [Function; FUNCTIONS] = [
     ),
     function(
         "count_services",
-        SERVICE,
+        SERVICE_ARGUMENTS,
         "Return the number of servers of a service.",
         |query, arguments| {
             let (name, dialect) = (full_name(arguments, "service")?, query.caller.dialect());
@@ -202,7 +202,7 @@ pub(super) const ALL: [Function; FUNCTIONS] = [
     ),
     function(
         "count_subscribers",
-        TOPIC,
+        TOPIC_ARGUMENTS,
         "Return the number of subscriptions on a topic.",
         |query, arguments| {
             Ok(Value::count(
@@ -212,7 +212,7 @@ pub(super) const ALL: [Function; FUNCTIONS] = [
     ),
     function(
         "get_action_client_names_and_types_by_node",
-        NODE,
+        NODE_ARGUMENTS,
         "Get the actions that a node calls.",
         |query, arguments| {
             let node = query.node(arguments, "action client");
@@ -221,7 +221,7 @@ pub(super) const ALL: [Function; FUNCTIONS] = [
     ),
     function(
         "get_action_clients_info_by_action",
-        ACTION,
+        ACTION_ARGUMENTS,
         "Return the clients of an action.",
         |query, arguments| query.action_info(arguments, Side::Client),
     ),
@@ -233,7 +233,7 @@ pub(super) const ALL: [Function; FUNCTIONS] = [
     ),
     function(
         "get_action_server_names_and_types_by_node",
-        NODE,
+        NODE_ARGUMENTS,
         "Get the actions that a node offers.",
         |query, arguments| {
             let node = query.node(arguments, "action server");
@@ -242,13 +242,13 @@ pub(super) const ALL: [Function; FUNCTIONS] = [
     ),
     function(
         "get_action_servers_info_by_action",
-        ACTION,
+        ACTION_ARGUMENTS,
         "Return the servers of an action.",
         |query, arguments| query.action_info(arguments, Side::Server),
     ),
     function(
         "get_client_names_and_types_by_node",
-        NODE,
+        NODE_ARGUMENTS,
         "Get the services that a node calls.",
         |query, arguments| {
             let node = query.node(arguments, "client");
@@ -257,7 +257,7 @@ pub(super) const ALL: [Function; FUNCTIONS] = [
     ),
     function(
         "get_clients_info_by_service",
-        SERVICE,
+        SERVICE_ARGUMENTS,
         "Return the clients of a service.",
         |query, arguments| query.service_info(arguments, Side::Client),
     ),
@@ -310,7 +310,7 @@ pub(super) const ALL: [Function; FUNCTIONS] = [
     ),
     function(
         "get_publisher_names_and_types_by_node",
-        NODE,
+        NODE_ARGUMENTS,
         "Get the topics that a node publishes.",
         |query, arguments| {
             let node = query.node(arguments, "publisher");
@@ -320,14 +320,14 @@ pub(super) const ALL: [Function; FUNCTIONS] = [
     .flag("no_demangle"),
     function(
         "get_publishers_info_by_topic",
-        TOPIC,
+        TOPIC_ARGUMENTS,
         "Return the publishers on a topic.",
         |query, arguments| query.topic_info(arguments, Endpoints::Writers),
     )
     .flag("no_mangle"),
     function(
         "get_servers_info_by_service",
-        SERVICE,
+        SERVICE_ARGUMENTS,
         "Return the servers of a service.",
         |query, arguments| query.service_info(arguments, Side::Server),
     ),
@@ -339,7 +339,7 @@ pub(super) const ALL: [Function; FUNCTIONS] = [
     ),
     function(
         "get_service_names_and_types_by_node",
-        NODE,
+        NODE_ARGUMENTS,
         "Get the services that a node offers.",
         |query, arguments| {
             let node = query.node(arguments, "service");
@@ -348,7 +348,7 @@ pub(super) const ALL: [Function; FUNCTIONS] = [
     ),
     function(
         "get_subscriber_names_and_types_by_node",
-        NODE,
+        NODE_ARGUMENTS,
         "Get the topics that a node subscribes to.",
         |query, arguments| {
             let node = query.node(arguments, "subscriber");
@@ -358,7 +358,7 @@ pub(super) const ALL: [Function; FUNCTIONS] = [
     .flag("no_demangle"),
     function(
         "get_subscriptions_info_by_topic",
-        TOPIC,
+        TOPIC_ARGUMENTS,
         "Return the subscriptions on a topic.",
         |query, arguments| query.topic_info(arguments, Endpoints::Readers),
     )

@@ -11,8 +11,8 @@ use ros2probe_model::report::snapshot::{EndpointFacts, NodeFacts, Snapshot, Topi
 use ros2probe_wire::{DomainId, Guid, GuidPrefix};
 
 /// Suffixes of an action's feedback topic and of its type.
-const FEEDBACK: &str = "/_action/feedback";
-const FEEDBACK_TYPE: &str = "_FeedbackMessage";
+const FEEDBACK_TOPIC_SUFFIX: &str = "/_action/feedback";
+const FEEDBACK_TYPE_SUFFIX: &str = "_FeedbackMessage";
 
 /// Names with their types. Names and types are sorted.
 pub(super) type Names<'a> = BTreeMap<&'a str, BTreeSet<&'a str>>;
@@ -315,10 +315,10 @@ fn add<'a>(names: &mut Names<'a>, topic: &'a str, endpoint: &'a EndpointFacts) {
 
 fn actions(topics: Names<'_>) -> Names<'_> {
     let feedback = topics.into_iter().filter_map(|(name, types)| {
-        let name = name.strip_suffix(FEEDBACK)?;
+        let name = name.strip_suffix(FEEDBACK_TOPIC_SUFFIX)?;
         let types: BTreeSet<_> = types
             .into_iter()
-            .filter_map(|each| each.strip_suffix(FEEDBACK_TYPE))
+            .filter_map(|each| each.strip_suffix(FEEDBACK_TYPE_SUFFIX))
             .collect();
         (!types.is_empty()).then_some((name, types))
     });

@@ -148,7 +148,7 @@ impl Task {
                 accepted = ports.accept() => {
                     let state = Arc::new(ConnectionState::new(accepted.end.child_token()));
                     if !accepted.address.ip().is_loopback() || !connections.join(&state) {
-                        self.figures.refuse(Refused::Full);
+                        self.figures.count_refusal(Refused::Full);
                         drop(Stream::new(accepted.stream, &state));
                         continue;
                     }
@@ -164,7 +164,7 @@ impl Task {
         let state = self.latest.state();
         let seen = state.known().participants.iter();
         let seen = seen.map(|participant| participant.domain_id.0);
-        let in_force = self.watches.in_force();
+        let in_force = self.watches.active();
         let watched = in_force.watchlist().watches().iter();
         let watched = watched.filter_map(|watch| Some(watch.domain_id?.0));
         let domains = [0].into_iter().chain(watched).chain(seen);

@@ -18,10 +18,10 @@ const MAX_VARIABLES: u64 = 128 << 10;
 const MAX_PROCESSES: usize = 4096;
 const MAX_DESCRIPTORS: usize = 4096;
 /// 127.0.0.1 as `/proc/net/tcp` writes it on little-endian machines.
-const LOOPBACK: &str = "0100007F";
+const LOOPBACK_HEX: &str = "0100007F";
 /// Columns of the user and of the inode in `/proc/net/tcp`.
-const USER: usize = 7;
-const INODE: usize = 9;
+const USER_COLUMN: usize = 7;
+const INODE_COLUMN: usize = 9;
 
 /// Facts about a client's process.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -42,7 +42,7 @@ pub(super) fn find(proc: &Path, client: u16, server: u16) -> Option<PeerProcess>
 
 /// Returns the user and the inode of the client's socket.
 fn socket(table: &str, client: u16, server: u16) -> Option<(u32, u64)> {
-    let address = |port: u16| format!("{LOOPBACK}:{port:04X}");
+    let address = |port: u16| format!("{LOOPBACK_HEX}:{port:04X}");
     let ends = (address(client), address(server));
     table.lines().find_map(|line| {
         let columns: Vec<&str> = line.split_ascii_whitespace().collect();
@@ -50,8 +50,8 @@ fn socket(table: &str, client: u16, server: u16) -> Option<(u32, u64)> {
             return None;
         }
         Some((
-            columns.get(USER)?.parse().ok()?,
-            columns.get(INODE)?.parse().ok()?,
+            columns.get(USER_COLUMN)?.parse().ok()?,
+            columns.get(INODE_COLUMN)?.parse().ok()?,
         ))
     })
 }
@@ -62,7 +62,7 @@ fn process(proc: &Path, user: u32, inode: u64) -> Option<PathBuf> {
     let processes = fs::read_dir(proc)
         .ok()?
         .filter_map(|entry| Some(entry.ok()?.path()));
-    let mut processes = numbered(processes)
+    let mut processes = process_paths(processes)
         .filter(|path| fs::metadata(path).is_ok_and(|metadata| metadata.uid() == user));
     processes.find(|path| {
         let descriptors = fs::read_dir(path.join("fd")).into_iter().flatten();
@@ -74,7 +74,7 @@ fn process(proc: &Path, user: u32, inode: u64) -> Option<PathBuf> {
 }
 
 /// Returns the paths of processes, whose names are numbers, up to the cap.
-fn numbered(paths: impl Iterator<Item = PathBuf>) -> impl Iterator<Item = PathBuf> {
+fn process_paths(paths: impl Iterator<Item = PathBuf>) -> impl Iterator<Item = PathBuf> {
     let is_number = |path: &PathBuf| {
         let name = path.file_name().and_then(|name| name.to_str());
         name.is_some_and(|name| name.bytes().all(|byte| byte.is_ascii_digit()))
@@ -206,7 +206,7 @@ mod tests {
             .map(|id| id.to_string().into())
             .collect();
         let names = ids.iter().cloned().chain(["net".into(), "self".into()]);
-        assert_eq!(numbered(names).count(), MAX_PROCESSES);
+        assert_eq!(process_paths(names).count(), MAX_PROCESSES);
     }
 
     #[test]

@@ -22,10 +22,10 @@ use crate::tables::Ros2DaemonPorts;
 use ros2probe_model::facts::bounded::Bounded;
 
 /// Time for which a released port stays free.
-pub(super) const RELEASED: Duration = Duration::from_secs(60);
+pub(super) const RELEASE_TIME: Duration = Duration::from_secs(60);
 
 /// Time for which a port of another process has to be free before the agent takes it over.
-const TAKEOVER: Duration = Duration::from_secs(3);
+const TAKEOVER_DELAY: Duration = Duration::from_secs(3);
 
 /// The ports of all domains.
 #[derive(Debug)]
@@ -75,13 +75,13 @@ impl Ports {
             }
             let is_left_out = self.ports.insert(*domain_id, Port::Waiting).is_some();
             if is_left_out && port(*domain_id).is_some() {
-                self.show(*domain_id, PortState::Limit);
+                self.set_state(*domain_id, PortState::Limit);
             }
         }
         let is_due = |port: &Port| match port {
             Port::Open(..) => false,
             Port::Waiting | Port::Occupied | Port::Free(_) => true,
-            Port::Released(since) => now.saturating_duration_since(*since) >= RELEASED,
+            Port::Released(since) => now.saturating_duration_since(*since) >= RELEASE_TIME,
         };
         let due = self.ports.iter().filter(|(_, port)| is_due(port));
         let due: Vec<u32> = due.map(|(domain_id, _)| *domain_id).collect();
@@ -99,7 +99,7 @@ impl Ports {
         let Port::Open(_, end) = std::mem::replace(port, Port::Released(now)) else {
             return None;
         };
-        self.show(domain_id, PortState::Released);
+        self.set_state(domain_id, PortState::Released);
         Some(end)
     }
 
@@ -152,7 +152,7 @@ impl Ports {
                 *state = Port::Free(now);
                 false
             }
-            Port::Free(since) => now.saturating_duration_since(since) >= TAKEOVER,
+            Port::Free(since) => now.saturating_duration_since(since) >= TAKEOVER_DELAY,
         }
     }
 
@@ -173,11 +173,11 @@ impl Ports {
             Err(error) => (Port::Waiting, PortState::Failed(error.to_string())),
         };
         self.ports.insert(domain_id, port);
-        self.show(domain_id, state);
+        self.set_state(domain_id, state);
     }
 
     /// Records the state of a port, and logs its changes.
-    fn show(&self, domain_id: u32, state: PortState) {
+    fn set_state(&self, domain_id: u32, state: PortState) {
         if !self.figures.set_port(domain_id, state.clone()) {
             return;
         }
@@ -225,7 +225,7 @@ mod tests {
     use super::*;
 
     #[tokio::test(start_paused = true)]
-    async fn a_port_of_another_process_is_taken_over_a_while_after_it_is_free() {
+    async fn a_free_port_of_another_process_is_taken_over_after_a_delay() {
         const OTHER: u32 = DOMAIN + 3;
         let figures = Arc::<Ros2DaemonFigures>::default();
         let mut ports = Ports::new(Arc::clone(&figures));
@@ -235,14 +235,17 @@ mod tests {
         let other = std::net::TcpListener::bind(address).unwrap();
         let start = Instant::now();
         ports.update(&domains, start);
-        ports.update(&domains, start + TAKEOVER);
+        ports.update(&domains, start + TAKEOVER_DELAY);
         assert_eq!(state(), PortState::Occupied);
         drop(other);
-        ports.update(&domains, start + TAKEOVER);
-        ports.update(&domains, start + TAKEOVER * 2 - Duration::from_millis(1));
+        ports.update(&domains, start + TAKEOVER_DELAY);
+        ports.update(
+            &domains,
+            start + TAKEOVER_DELAY * 2 - Duration::from_millis(1),
+        );
         // No process listens, so `ros2 daemon stop` ends.
         assert!(std::net::TcpStream::connect(address).is_err());
-        ports.update(&domains, start + TAKEOVER * 2);
+        ports.update(&domains, start + TAKEOVER_DELAY * 2);
         assert_eq!(state(), PortState::Listening);
     }
 
@@ -261,13 +264,13 @@ mod tests {
         let end = ports.release(DOMAIN, released).unwrap();
         assert!(!end.is_cancelled());
         assert!(ports.release(DOMAIN, released).is_none());
-        ports.update(&domains, released + RELEASED - Duration::from_millis(1));
+        ports.update(&domains, released + RELEASE_TIME - Duration::from_millis(1));
         assert_eq!(state(), PortState::Released);
-        ports.update(&domains, released + RELEASED);
+        ports.update(&domains, released + RELEASE_TIME);
         assert_eq!(state(), PortState::Listening);
-        ports.release(DOMAIN, released + RELEASED).unwrap();
+        ports.release(DOMAIN, released + RELEASE_TIME).unwrap();
         ports.end_releases();
-        ports.update(&domains, released + RELEASED);
+        ports.update(&domains, released + RELEASE_TIME);
         assert_eq!(state(), PortState::Listening);
         assert!(ports.release(DOMAIN + 1, released).is_none());
     }

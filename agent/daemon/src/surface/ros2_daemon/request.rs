@@ -33,7 +33,7 @@ use crate::surface::authority;
 use crate::surface::large_responses::LargeResponses;
 
 /// Path of the daemon.
-const PATH: &str = "/ros2cli/";
+const DAEMON_PATH: &str = "/ros2cli/";
 /// Maximum size of a request's body, in bytes.
 pub(super) const MAX_BODY: usize = 16 << 10;
 /// Maximum size of a request's head in bytes, and maximum number of its fields.
@@ -41,14 +41,14 @@ const MAX_HEAD: usize = 8 << 10;
 const MAX_FIELDS: usize = 32;
 /// Maximum age of a state that is used without a refresh. A command sends several requests in quick
 /// succession.
-const CURRENT: Duration = Duration::from_millis(200);
+const MAX_STATE_AGE: Duration = Duration::from_millis(200);
 /// Maximum time that a request waits for a fresh state.
-const TIMEOUT: Duration = Duration::from_millis(300);
+const STATE_TIMEOUT: Duration = Duration::from_millis(300);
 /// Bytes of the random part of the daemon's name.
 const NAME_BYTES: usize = 16;
 
 /// Large answers that are being created and read.
-static ANSWERS: LargeResponses = LargeResponses::new();
+static LARGE_ANSWERS: LargeResponses = LargeResponses::new();
 
 /// Handler of all requests.
 #[derive(Debug)]
@@ -128,18 +128,18 @@ impl Requests {
     async fn respond(&self, request: Request<Incoming>, origin: &Origin) -> Response<Body> {
         let (head, body) = request.into_parts();
         if let Err((reason, status)) = check(&head.method, head.uri.path(), &head.headers) {
-            self.figures.refuse(reason);
+            self.figures.count_refusal(reason);
             return refusal(status);
         }
         let Ok(body) = to_bytes(Body::new(body), MAX_BODY).await else {
-            self.figures.refuse(Refused::Size);
+            self.figures.count_refusal(Refused::Size);
             return refusal(StatusCode::PAYLOAD_TOO_LARGE);
         };
         // Until this call, the connection counts as idle and can be closed for others, because its
         // client may never finish.
         origin.state.requested();
-        let Some(turn) = ANSWERS.turn().await else {
-            self.figures.refuse(Refused::Memory);
+        let Some(turn) = LARGE_ANSWERS.permit().await else {
+            self.figures.count_refusal(Refused::Memory);
             return refusal(StatusCode::SERVICE_UNAVAILABLE);
         };
         let user_agent = head
@@ -150,7 +150,7 @@ impl Requests {
             Ok(call) => self.answer(&call, origin, user_agent).await,
             Err(malformed) => (Err(self.malformed(malformed)), false),
         };
-        let body = turn.keep(Bytes::from(answer(&result)));
+        let body = turn.body(Bytes::from(answer(&result)));
         let mut response = Response::new(body);
         let headers = response.headers_mut();
         headers.insert(CONTENT_TYPE, HeaderValue::from_static("text/xml"));
@@ -170,8 +170,8 @@ impl Requests {
     ) -> (Result<Value, Fault>, bool) {
         self.figures.request(&call.method);
         let is_about_graph = !call.method.starts_with("system.");
-        if is_about_graph && self.latest.state().agent.at.elapsed() > CURRENT {
-            self.latest.refresh(TIMEOUT).await;
+        if is_about_graph && self.latest.state().agent.collected_at.elapsed() > MAX_STATE_AGE {
+            self.latest.refresh(STATE_TIMEOUT).await;
         }
         let state = self.latest.state();
         let domain_id = DomainId(origin.domain_id);
@@ -216,7 +216,7 @@ impl Requests {
 
     /// Counts a body that is not a call, and returns Python's exception for it.
     fn malformed(&self, malformed: Malformed) -> Fault {
-        self.figures.refuse(Refused::Malformed);
+        self.figures.count_refusal(Refused::Malformed);
         let class = match malformed {
             Malformed::Encoding | Malformed::Xml => "xml.parsers.expat.ExpatError",
             _ => "xmlrpc.client.ResponseError",
@@ -233,7 +233,7 @@ fn check(method: &Method, path: &str, headers: &HeaderMap) -> Result<(), (Refuse
     if method != Method::POST {
         return Err((Refused::Path, StatusCode::NOT_IMPLEMENTED));
     }
-    if path != PATH {
+    if path != DAEMON_PATH {
         return Err((Refused::Path, StatusCode::NOT_FOUND));
     }
     // A web page cannot send this media type to another origin without the permission of that

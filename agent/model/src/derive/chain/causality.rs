@@ -21,13 +21,13 @@ use crate::facts::names::{NodeName, TopicName};
 use crate::facts::tables::CausalPublications;
 
 /// Time after which a publication that no other continues ends its chain.
-const QUIET: Duration = Duration::from_secs(2);
+const CHAIN_END_SILENCE: Duration = Duration::from_secs(2);
 /// Time for which a publication is remembered, so that others can continue it.
-const REMEMBERED: Duration = Duration::from_secs(5);
+const PUBLICATION_LIFETIME: Duration = Duration::from_secs(5);
 /// Maximum time from the start of a publication to the source timestamp of its message.
-const WRITING: Duration = Duration::from_millis(10);
+const MAX_WRITE_DELAY: Duration = Duration::from_millis(10);
 /// Number of latest publications that are searched for the hop before a publication.
-const SEARCHED: usize = 2048;
+const MAX_SEARCHED: usize = 2048;
 /// Maximum number of hops of a chain.
 const MAX_HOPS: usize = 31;
 
@@ -123,9 +123,11 @@ impl Causality {
             let end = hop.points.last().map(|point| point.published);
             hop.domain_id == *domain_id
                 && hop.topics.last().is_some_and(|(topic, _)| topic == input)
-                && end.is_some_and(|end| end <= *input_source && *input_source - end <= WRITING)
+                && end.is_some_and(|end| {
+                    end <= *input_source && *input_source - end <= MAX_WRITE_DELAY
+                })
         };
-        let mut latest = self.publications.iter_mut().rev().take(SEARCHED);
+        let mut latest = self.publications.iter_mut().rev().take(MAX_SEARCHED);
         let before = latest.find(is_origin);
         let (mut topics, mut points, decision) = match before {
             Some(hop) if hop.points.len() <= MAX_HOPS => {
@@ -165,11 +167,11 @@ impl Causality {
                     input,
                     output,
                 };
-                let latest = self.publications.iter().rev().take(SEARCHED);
+                let latest = self.publications.iter().rev().take(MAX_SEARCHED);
                 let known = latest.filter_map(|hop| hop.traced);
                 match decision {
                     Decision::Share(share) => step.begin(share, known, tracer),
-                    Decision::Hop(before) => Some(step.go_on(before, known, tracer)),
+                    Decision::Hop(before) => Some(step.continue_spans(before, known, tracer)),
                 }
             });
         self.publications.push_back(Hop {
@@ -189,12 +191,12 @@ impl Causality {
         paths: &mut Paths,
         expected: &mut ExpectedChains,
     ) {
-        let quiet = |hop: &&mut Hop| now - hop.at >= QUIET;
+        let quiet = |hop: &&mut Hop| now - hop.at >= CHAIN_END_SILENCE;
         for hop in self.publications.iter_mut().filter(quiet) {
             hop.end(paths, expected);
         }
         while let Some(hop) = self.publications.front()
-            && now - hop.at >= REMEMBERED
+            && now - hop.at >= PUBLICATION_LIFETIME
         {
             self.publications.pop_front();
         }

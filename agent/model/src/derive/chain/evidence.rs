@@ -9,8 +9,8 @@
 //! - Several remaining candidates are ambiguous, and none of them counts.
 //! - A stamp that originates at several nodes is shared, and is not evidence.
 //!
-//! A hop is accepted after [`ENOUGH`] matches, if the node's output mostly has the stamp of some
-//! input and the input is hardly ever late.
+//! A hop is accepted after [`MIN_MATCHES`] matches, if the node's output mostly has the stamp of
+//! some input and the input is hardly ever late.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
@@ -29,16 +29,16 @@ use crate::facts::tables::{EvidenceInputs, EvidenceOutputs, LatestStamps};
 use crate::measure::topic::TopicId;
 
 /// Minimum number of matches of an accepted hop, for ordinary and for rounded stamps.
-const ENOUGH: u32 = 5;
-const ENOUGH_ROUNDED: u32 = 20;
+const MIN_MATCHES: u32 = 5;
+const MIN_ROUNDED_MATCHES: u32 = 20;
 /// Number of outputs after which all counts are halved, so that recent outputs prevail.
-const HALVED: u32 = 256;
+const HALVING_INTERVAL: u32 = 256;
 /// A stamp that is a multiple of this many nanoseconds is rounded.
-const ROUNDED: u32 = 100_000;
+const ROUNDED_STAMP_UNIT: u32 = 100_000;
 /// Minimum number of outputs of a node that is reported as re-stamping.
-const RESTAMPED: u32 = 20;
+const MIN_RESTAMPED_OUTPUTS: u32 = 20;
 /// A message whose age is below this many nanoseconds was stamped at publication.
-const FRESH: i64 = 1_000_000;
+const FRESH_AGE: i64 = 1_000_000;
 
 /// Evidence about all outputs.
 #[derive(Debug, Default)]
@@ -113,7 +113,7 @@ impl Evidence {
             return;
         };
         counts.aged += 1;
-        if !(0..FRESH).contains(&age) {
+        if !(0..FRESH_AGE).contains(&age) {
             return;
         }
         counts.fresh += 1;
@@ -139,7 +139,7 @@ impl Evidence {
             .as_mut_slice()
             .sort_by_key(|message| message.published);
         let messages = SameStamp::of(&group.messages);
-        let is_rounded = group.stamp.1.is_multiple_of(ROUNDED);
+        let is_rounded = group.stamp.1.is_multiple_of(ROUNDED_STAMP_UNIT);
         let is_shared = group.is_crowded || messages.has_several_origins(is_rounded);
         for (index, message) in messages.list.iter().enumerate() {
             let Some(counts) = counts(&mut self.outputs, &message.output) else {
@@ -163,7 +163,7 @@ impl Evidence {
                     input.late += 1;
                 }
             }
-            if counts.outputs >= HALVED {
+            if counts.outputs >= HALVING_INTERVAL {
                 counts.halve();
             }
         }
@@ -184,7 +184,8 @@ impl Evidence {
     /// that of an input.
     pub(super) fn restamping(&self, rates: &Rates<'_>) -> Vec<Diagnosis> {
         let restamped = self.outputs.iter().filter_map(|((topic, node), counts)| {
-            let enough = counts.outputs >= RESTAMPED && counts.aged >= RESTAMPED;
+            let enough =
+                counts.outputs >= MIN_RESTAMPED_OUTPUTS && counts.aged >= MIN_RESTAMPED_OUTPUTS;
             let most = |count: u32, of: u32| u64::from(count) * 10 >= u64::from(of) * 9;
             let is_new = most(counts.own, counts.outputs) && most(counts.fresh, counts.aged);
             if !enough || !is_new || counts.matched > 0 {
@@ -239,8 +240,8 @@ impl Counts {
             |count: u32, percent: u64| u64::from(count) * 100 >= u64::from(self.outputs) * percent;
         let is_rounded = self.rounded * 2 > self.outputs;
         let (enough, late) = match is_rounded {
-            true => (ENOUGH_ROUNDED, 0),
-            false => (ENOUGH, input.matched / 50),
+            true => (MIN_ROUNDED_MATCHES, 0),
+            false => (MIN_MATCHES, input.matched / 50),
         };
         input.matched >= enough
             && input.late <= late

@@ -109,7 +109,7 @@ mod tests {
     }
 
     #[test]
-    fn each_bucket_has_at_most_one_exemplar_which_lies_within_the_bucket() {
+    fn each_bucket_has_at_most_one_exemplar_within_its_bounds() {
         let (mut exemplars, mut histogram) = (Exemplars::default(), Histogram::default());
         let bounds: Vec<_> = histogram.buckets().map(|(bound, _)| bound).collect();
         for step in 1..2_000_u32 {

@@ -23,8 +23,8 @@ use crate::measure::topic::{TopicId, Topics};
 /// Maximum number of configured chains.
 pub const MAX_CHAINS: usize = 64;
 /// Time over which a chain is compared with its limit, and the minimum number of messages for it.
-const JUDGED: Duration = Duration::from_secs(10);
-const FEWEST: usize = 5;
+const EVALUATION_WINDOW: Duration = Duration::from_secs(10);
+const MIN_MESSAGES: usize = 5;
 
 /// A configured chain.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -242,7 +242,10 @@ impl Progress {
     }
 
     fn state(&self, chain: &ExpectedChain, now: Timestamp) -> ChainState {
-        let recent = self.recent.iter().filter(|(last, _)| *last + JUDGED > now);
+        let recent = self
+            .recent
+            .iter()
+            .filter(|(last, _)| *last + EVALUATION_WINDOW > now);
         let latency = Quantiles::of(recent.map(|(last, first)| *last - *first));
         let Some(latency) = latency else {
             return ChainState::Idle;
@@ -250,7 +253,7 @@ impl Progress {
         let is_slow = chain
             .max_latency
             .is_some_and(|max| latency.p99 > max.as_secs_f64());
-        match is_slow && latency.count >= FEWEST {
+        match is_slow && latency.count >= MIN_MESSAGES {
             true => ChainState::Slow,
             false => ChainState::Ok,
         }

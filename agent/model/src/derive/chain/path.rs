@@ -17,9 +17,9 @@ use crate::facts::tables::{ChainPaths, ChainTraces};
 /// Maximum number of topics in a chain.
 pub const MAX_TOPICS: usize = 32;
 /// Minimum number of messages of a chain that is shown.
-const ENOUGH: u64 = 5;
+const MIN_MESSAGES: u64 = 5;
 /// Time without a message after which a new chain may replace a chain.
-const IDLE: Duration = Duration::from_secs(60);
+const IDLE_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// All chains with messages.
 #[derive(Debug, Default)]
@@ -139,7 +139,8 @@ impl Paths {
                 self.paths.insert(Arc::clone(&path), progress);
             }
             if self.paths.is_full() {
-                self.paths.retain(|_, known| known.last + IDLE > last);
+                self.paths
+                    .retain(|_, known| known.last + IDLE_TIMEOUT > last);
             }
             if self.paths.is_full() && !self.paths.contains_key(&path) {
                 self.paths.refuse();
@@ -169,7 +170,10 @@ impl Paths {
 
     /// Returns the chains with enough messages.
     pub(super) fn shown(&self) -> Vec<ChainFacts> {
-        let shown = self.paths.iter().filter(|(_, each)| each.count >= ENOUGH);
+        let shown = self
+            .paths
+            .iter()
+            .filter(|(_, each)| each.count >= MIN_MESSAGES);
         let chains = shown.map(|(path, progress)| ChainFacts {
             path: Arc::clone(path),
             count: progress.count,

@@ -6,7 +6,7 @@ use crate::measure::profiler::Profiler;
 use crate::measure::topic::{TopicId, Topics};
 
 /// Minimum number of messages for a comparison of rates.
-const FEWEST: u64 = 20;
+const MIN_MESSAGES: u64 = 20;
 
 /// The numbers of messages of the last seconds.
 pub(super) struct Rates<'a> {
@@ -25,10 +25,10 @@ impl<'a> Rates<'a> {
     }
 
     /// Returns whether the rates of both topics differ by at most 5 %, or one message. Returns
-    /// `false` if either topic has fewer than [`FEWEST`] messages.
+    /// `false` if either topic has fewer than [`MIN_MESSAGES`] messages.
     pub(super) fn are_equal(&self, one: TopicId, other: TopicId) -> bool {
         let (one, other) = (self.messages(one), self.messages(other));
-        one.min(other) >= FEWEST && one.abs_diff(other) <= (one.max(other) / 20).max(1)
+        one.min(other) >= MIN_MESSAGES && one.abs_diff(other) <= (one.max(other) / 20).max(1)
     }
 
     fn messages(&self, id: TopicId) -> u64 {

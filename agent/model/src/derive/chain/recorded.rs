@@ -23,7 +23,7 @@ use foldhash::{HashMap, HashMapExt as _};
 use ros2probe_wire::Timestamp;
 
 use super::path::{ChainFacts, Paths};
-use super::stamps::{LONGEST, QUIET, Stamp};
+use super::stamps::{EVALUATION_SILENCE, MAX_CHAIN_DURATION, Stamp};
 use crate::facts::names::TopicName;
 
 /// Maximum number of topics.
@@ -41,7 +41,7 @@ const ROUNDED: u32 = 100_000;
 #[derive(Debug)]
 pub struct RecordedChains {
     /// Maximum number of messages to keep.
-    room: usize,
+    limit: usize,
     topics: Vec<Topic>,
     ids: HashMap<TopicName, u16>,
     open: HashMap<Stamp, Open>,
@@ -56,7 +56,7 @@ pub struct RecordedChains {
     /// Whether publication times differ from log times, and whether some message has no publication
     /// time.
     has_published: bool,
-    lacks_published: bool,
+    misses_publish_times: bool,
     rounded: u64,
     refused: u64,
     is_full: bool,
@@ -114,14 +114,14 @@ struct Open {
 
 impl Default for RecordedChains {
     fn default() -> Self {
-        Self::with_room(MAX_RECORDED)
+        Self::with_limit(MAX_RECORDED)
     }
 }
 
 impl RecordedChains {
-    fn with_room(room: usize) -> Self {
+    fn with_limit(room: usize) -> Self {
         Self {
-            room,
+            limit: room,
             topics: Vec::new(),
             ids: HashMap::new(),
             open: HashMap::new(),
@@ -131,7 +131,7 @@ impl RecordedChains {
             messages: Vec::new(),
             ends: Vec::new(),
             has_published: false,
-            lacks_published: false,
+            misses_publish_times: false,
             rounded: 0,
             refused: 0,
             is_full: false,
@@ -152,7 +152,7 @@ impl RecordedChains {
         self.elapsed = self.elapsed.saturating_add(step);
         self.close(self.elapsed);
         let published = published.filter(|published| published.0 > 0);
-        self.lacks_published |= published.is_none();
+        self.misses_publish_times |= published.is_none();
         self.has_published |= published.is_some_and(|published| published != logged);
         if stamp == (0, 0) {
             return;
@@ -196,7 +196,7 @@ impl RecordedChains {
     #[must_use]
     pub fn finish(mut self, preferred: &[&str]) -> RecordedFacts {
         self.close(Duration::MAX);
-        let times = match self.has_published && !self.lacks_published {
+        let times = match self.has_published && !self.misses_publish_times {
             true => Times::Publish,
             false => Times::Log,
         };
@@ -234,8 +234,10 @@ impl RecordedChains {
     /// Closes the stamps that no further message can have.
     fn close(&mut self, elapsed: Duration) {
         while let Some(stamp) = self.order.front() {
-            let is_open =
-                |open: &Open| elapsed - open.first < LONGEST && elapsed - open.last < QUIET;
+            let is_open = |open: &Open| {
+                elapsed - open.first < MAX_CHAIN_DURATION
+                    && elapsed - open.last < EVALUATION_SILENCE
+            };
             if self.open.len() < MAX_OPEN && self.open.get(stamp).is_some_and(is_open) {
                 return;
             }
@@ -243,7 +245,7 @@ impl RecordedChains {
             self.order.pop_front();
             let Some(open) = open else { continue };
             // Nothing after the cap counts, as if the recording ended there.
-            self.is_full |= self.messages.len() + open.messages.len() > self.room;
+            self.is_full |= self.messages.len() + open.messages.len() > self.limit;
             if self.is_full {
                 self.refused += open.messages.len() as u64;
                 continue;

@@ -20,12 +20,12 @@ use crate::facts::tables::{
 };
 
 /// Time without a message after which the messages of a stamp are evaluated.
-pub(super) const QUIET: Duration = Duration::from_secs(2);
-/// Time after which the messages of a stamp are evaluated even if more may follow. Longer chains are
-/// not recognized.
-pub(super) const LONGEST: Duration = Duration::from_secs(5);
+pub(super) const EVALUATION_SILENCE: Duration = Duration::from_secs(2);
+/// Time after which the messages of a stamp are evaluated even if more may follow. Longer chains
+/// are not recognized.
+pub(super) const MAX_CHAIN_DURATION: Duration = Duration::from_secs(5);
 /// Time for which later messages of an evaluated stamp are ignored.
-const REMEMBERED: Duration = Duration::from_secs(10);
+const EVALUATED_STAMP_LIFETIME: Duration = Duration::from_secs(10);
 /// Maximum nanoseconds from INFO_TS to the capture for which INFO_TS counts as the time of
 /// publication.
 const PLAUSIBLE_DELAY: i64 = 1_000_000_000;
@@ -198,12 +198,13 @@ impl Messages {
             let Some(waiting) = stamps.get_mut(key) else {
                 return false;
             };
-            if now - waiting.last >= QUIET || now - waiting.first >= LONGEST {
+            if now - waiting.last >= EVALUATION_SILENCE || now - waiting.first >= MAX_CHAIN_DURATION
+            {
                 let group = waiting.group.take();
                 open.sub(group.as_ref().map_or(0, |each| each.messages.len()));
                 due.extend(group);
             }
-            let is_kept = waiting.group.is_some() || now - waiting.last < REMEMBERED;
+            let is_kept = waiting.group.is_some() || now - waiting.last < EVALUATED_STAMP_LIFETIME;
             if !is_kept {
                 stamps.remove(key);
             }

@@ -7,22 +7,23 @@ use ros2probe_wire::time::nanoseconds;
 use crate::facts::model_time::ModelTime;
 use crate::facts::wall_clock::WallClock;
 
-/// A bound widens by one nanosecond in this many: 100 ppm, for two clocks that drift by 50 ppm each.
-const DRIFT: i64 = 10_000;
+/// A bound widens by one nanosecond in this many: 100 ppm, for two clocks that drift by 50 ppm
+/// each.
+const DRIFT_DIVISOR: i64 = 10_000;
 /// Time in which the fastest message and the fastest round trip are found.
 const WINDOW: Duration = Duration::from_secs(10);
 /// Evidence expires after this time: it has widened by 12 ms then.
-const EXPIRY: Duration = Duration::from_secs(120);
+const EVIDENCE_TIMEOUT: Duration = Duration::from_secs(120);
 /// Time after which a round trip is no evidence: the network may be another one.
-const TRIP_EXPIRY: Duration = Duration::from_secs(600);
+const ROUND_TRIP_TIMEOUT: Duration = Duration::from_secs(600);
 /// Nanoseconds for which the fastest message may wait between its stamp and its sending.
-const STAMPING: i64 = 500_000;
+const MAX_STAMPING_DELAY: i64 = 500_000;
 /// Messages among which one is expected to be as fast as a round trip.
-const ENOUGH: u32 = 20;
-/// Several messages of each second, all later than the fastest one by `STEP` nanoseconds, show a
-/// step back of the clock or another path.
-const SEVERAL: u32 = 5;
-const STEP: i64 = 100_000_000;
+const MIN_MESSAGES: u32 = 20;
+/// Several messages of each second, all later than the fastest one by `MIN_STEP` nanoseconds, show
+/// a step back of the clock or another path.
+const MIN_LATE_MESSAGES: u32 = 5;
+const MIN_STEP: i64 = 100_000_000;
 /// Number of such seconds. Old messages for a late joiner arrive within one.
 const LATE_SECONDS: u32 = 2;
 
@@ -133,7 +134,7 @@ impl Range {
 
 impl Aged {
     fn drift(self, now: ModelTime) -> i64 {
-        now.nanoseconds_since(self.at).max(0) / DRIFT
+        now.nanoseconds_since(self.at).max(0) / DRIFT_DIVISOR
     }
 
     fn least(self, now: ModelTime) -> i64 {
@@ -145,7 +146,7 @@ impl Aged {
     }
 
     fn is_valid(self, now: ModelTime) -> bool {
-        now - self.at < EXPIRY
+        now - self.at < EVIDENCE_TIMEOUT
     }
 }
 
@@ -159,8 +160,8 @@ impl Window {
     fn most(&self, now: ModelTime, known_trip: Option<i64>) -> Option<i64> {
         let least = self.least.filter(|least| least.is_valid(now))?;
         let round_trip = self.round_trip.or(known_trip);
-        let round_trip = round_trip.filter(|_| self.messages >= ENOUGH)?;
-        let later = round_trip.saturating_add(STAMPING);
+        let round_trip = round_trip.filter(|_| self.messages >= MIN_MESSAGES)?;
+        let later = round_trip.saturating_add(MAX_STAMPING_DELAY);
         Some(least.most(now).saturating_add(later))
     }
 }
@@ -177,7 +178,7 @@ impl Evidence {
             window.least = Some(Aged { value: ahead, at });
         }
         // Old messages for a late joiner are no evidence of speed.
-        let is_late = known.is_some_and(|known| ahead < known.saturating_sub(STEP));
+        let is_late = known.is_some_and(|known| ahead < known.saturating_sub(MIN_STEP));
         window.messages = window.messages.saturating_add(u32::from(!is_late));
     }
 
@@ -200,9 +201,9 @@ impl Evidence {
     pub(super) fn end_second(&mut self, now: ModelTime) -> bool {
         let (least, most, _) = self.relative(now);
         if let Some((best, messages)) = self.second.take() {
-            let is_late = least.is_some_and(|least| best < least.saturating_sub(STEP));
+            let is_late = least.is_some_and(|least| best < least.saturating_sub(MIN_STEP));
             self.late_seconds = match is_late {
-                true => self.late_seconds + u32::from(messages >= SEVERAL),
+                true => self.late_seconds + u32::from(messages >= MIN_LATE_MESSAGES),
                 false => 0,
             };
         }
@@ -222,11 +223,11 @@ impl Evidence {
         if let Some(most) = self.current.most(now, self.known_trip(now)) {
             lower(&mut self.trips, most, now);
         }
-        if self.current.messages >= ENOUGH && now - self.began >= WINDOW {
+        if self.current.messages >= MIN_MESSAGES && now - self.began >= WINDOW {
             self.previous = std::mem::take(&mut self.current);
             self.began = now;
         }
-        now - self.last < EXPIRY
+        now - self.last < EVIDENCE_TIMEOUT
     }
 
     /// Returns the bounds at `now`, relative to the wall clock.
@@ -252,7 +253,9 @@ impl Evidence {
 
     /// Returns the fastest round trip of the last window that had one.
     fn known_trip(&self, now: ModelTime) -> Option<i64> {
-        let known = self.known_trip.filter(|(_, at)| now - *at < TRIP_EXPIRY);
+        let known = self
+            .known_trip
+            .filter(|(_, at)| now - *at < ROUND_TRIP_TIMEOUT);
         known.map(|(time, _)| time)
     }
 
@@ -313,7 +316,7 @@ mod tests {
     fn the_bound_of_a_slow_peer_returns_after_a_step_back_of_its_clock() {
         let mut evidence = Evidence::default();
         seconds(&mut evidence, 1..100, 1, 0);
-        assert!(least(&evidence, 100).is_some_and(|bound| bound > -STEP));
+        assert!(least(&evidence, 100).is_some_and(|bound| bound > -MIN_STEP));
         seconds(&mut evidence, 100..400, 1, -1_000_000_000);
         let bound = least(&evidence, 400).unwrap();
         assert!(
@@ -323,16 +326,21 @@ mod tests {
     }
 
     #[test]
-    fn a_second_with_old_messages_for_a_late_joiner_is_no_step() {
+    fn a_second_with_old_messages_for_a_late_joiner_is_not_a_step() {
         let mut evidence = Evidence::default();
         seconds(&mut evidence, 1..100, 1, 0);
-        seconds(&mut evidence, 100..101, 2 * SEVERAL, -3_600_000_000_000);
+        seconds(
+            &mut evidence,
+            100..101,
+            2 * MIN_LATE_MESSAGES,
+            -3_600_000_000_000,
+        );
         seconds(&mut evidence, 101..110, 1, 0);
         assert_eq!(evidence.steps(), 0);
         seconds(
             &mut evidence,
             110..110 + u64::from(LATE_SECONDS),
-            SEVERAL,
+            MIN_LATE_MESSAGES,
             -1_000_000_000,
         );
         assert_eq!(evidence.steps(), 1, "a clock that was set back");

@@ -10,7 +10,7 @@ use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::{DomainId, Guid};
 
 use super::Findings;
-use super::half_known;
+use super::partly_known_domains;
 use crate::facts::diagnosis::{
     self, Diagnosis, Offer, Policies, Policy, QosPairs, TopicKey, Unmatched, Verdict,
 };
@@ -62,7 +62,7 @@ struct Group<'a> {
 }
 
 impl Reach {
-    const fn is_apart(self, other: Self) -> bool {
+    const fn is_unreachable(self, other: Self) -> bool {
         matches!(
             (self, other),
             (Self::Loopback, Self::OtherHost) | (Self::OtherHost, Self::Loopback)
@@ -72,7 +72,7 @@ impl Reach {
 
 impl<'a> EndpointExaminer<'a> {
     pub(super) fn new(discovery: &'a Discovery) -> Self {
-        let half_known = half_known(discovery);
+        let half_known = partly_known_domains(discovery);
         Self {
             discovery,
             half_known,
@@ -87,7 +87,7 @@ impl<'a> EndpointExaminer<'a> {
         self.types(topic, &key, findings);
         compare(&mut writers, &mut readers, &key, findings);
         self.buffers(topic, &key, findings);
-        if !is_about_hearing(topic) || self.half_known.contains(&topic.domain_id) {
+        if !needs_counterpart(topic) || self.half_known.contains(&topic.domain_id) {
             return Vec::new();
         }
         let groups = writers.iter().map(|group| (Role::Writer, group));
@@ -142,7 +142,7 @@ impl<'a> EndpointExaminer<'a> {
                     qos: &of_reader.qos,
                     vendor,
                 };
-                if !findings.spend(diagnosis::effort(offer.qos, request.qos)) {
+                if !findings.spend_steps(diagnosis::effort(offer.qos, request.qos)) {
                     findings.unexamined += 1;
                     return;
                 }
@@ -255,13 +255,13 @@ fn compare<'a>(
     key: &impl Fn() -> TopicKey,
     findings: &mut Findings,
 ) {
-    findings.turn();
+    findings.start_topic();
     let mut counts = [0_u64; Policy::ALL.len()];
     let mut listed = 0;
     let mut open = writers.len() as u64 * readers.len() as u64;
     'all: for writer in &mut *writers {
         for reader in &mut *readers {
-            if !findings.spend(diagnosis::effort(writer.offer.qos, reader.offer.qos)) {
+            if !findings.spend_steps(diagnosis::effort(writer.offer.qos, reader.offer.qos)) {
                 break 'all;
             }
             open -= 1;
@@ -273,7 +273,7 @@ fn compare<'a>(
             } else {
                 match diagnosis::verdict(writer.offer, reader.offer) {
                     Verdict::Match => {
-                        let is_apart = writer.reach.is_apart(reader.reach);
+                        let is_apart = writer.reach.is_unreachable(reader.reach);
                         is_apart.then_some(Unmatched::Unreachable)
                     }
                     Verdict::Partition => Some(Unmatched::Partition),
@@ -284,7 +284,7 @@ fn compare<'a>(
                         }
                         let room = PAIRS_PER_TOPIC - listed;
                         let new = list(writer, reader, policies, room, key, findings);
-                        findings.leave_out(pairs - new as u64);
+                        findings.note_omitted(pairs - new as u64);
                         listed += new;
                         Some(Unmatched::Qos)
                     }
@@ -341,7 +341,7 @@ fn list(
 /// Returns whether an endpoint without a counterpart is a problem on this topic. It is not a
 /// problem on topics that every node has anyway: `/rosout`, `/parameter_events`, a lifecycle node's
 /// `transition_event`, hidden topics, and topics of services and actions.
-fn is_about_hearing(topic: &Topic) -> bool {
+fn needs_counterpart(topic: &Topic) -> bool {
     let naming = &topic.naming;
     naming.kind == TopicKind::Topic
         && !naming.hidden

@@ -12,7 +12,7 @@ use crate::facts::names::TypeName;
 use crate::graph::discovery::Discovery;
 
 /// Steps that the comparison of two names takes.
-const STEPS: usize = 100;
+const STEPS_PER_PAIR: usize = 100;
 /// Maximum number of topics of each role that are compared.
 const MAX_TOPICS: usize = 512;
 
@@ -75,7 +75,7 @@ impl LonelyTopics {
     /// Adds the near misses.
     pub(super) fn examine(&self, discovery: &Discovery, findings: &mut Findings) {
         for of_type in self.types.values() {
-            findings.turn();
+            findings.start_topic();
             findings.unexamined += u64::from(!of_type.examine(discovery, findings));
         }
     }
@@ -86,7 +86,7 @@ impl OfType {
     fn examine(&self, discovery: &Discovery, findings: &mut Findings) -> bool {
         for publisher in &self.publishers {
             for subscription in &self.subscriptions {
-                if !findings.spend(STEPS) {
+                if !findings.spend_steps(STEPS_PER_PAIR) {
                     return false;
                 }
                 if let Some(difference) = difference(publisher, subscription, discovery) {

@@ -2,9 +2,10 @@
 //! period, callbacks that wait, messages overwritten in their queue.
 //!
 //! A rule is evaluated at each report, on the window of the last 5 to 10 s. A finding appears after
-//! [`BAD`] bad evaluations in a row and ends after [`GOOD`] good ones. Handles are not evaluated in
-//! their first [`GRACE`], because nodes load and connect when they start. A finding keeps its value
-//! until the value grows by half, so that it does not cause an event per second.
+//! [`BAD`] bad evaluations in a row and ends after [`EVALUATIONS_TO_CLEAR`] good ones. Handles are
+//! not evaluated in their first [`STARTUP_GRACE`], because nodes load and connect when they start.
+//! A finding keeps its value until the value grows by half, so that it does not cause an event per
+//! second.
 
 use std::time::Duration;
 
@@ -15,17 +16,17 @@ use crate::facts::calls::report::{Durations, Trigger};
 use crate::facts::model_time::ModelTime;
 
 /// Number of bad evaluations in a row after which a finding appears.
-const BAD: u8 = 3;
+const EVALUATIONS_TO_RAISE: u8 = 3;
 /// Number of good evaluations in a row after which a finding ends.
-const GOOD: u8 = 10;
+const EVALUATIONS_TO_CLEAR: u8 = 10;
 /// Time after the first report of a handle in which it is not evaluated.
-pub(super) const GRACE: Duration = Duration::from_secs(10);
+pub(super) const STARTUP_GRACE: Duration = Duration::from_secs(10);
 /// Minimum number of bad calls or messages in a window.
-const LEAST: u64 = 3;
+const MIN_VIOLATIONS: u64 = 3;
 /// Minimum share of bad calls or messages in a window, as a divisor: 1 %.
-const SHARE: u64 = 100;
+const MIN_VIOLATION_DIVISOR: u64 = 100;
 /// Minimum wait of a finding.
-const WAIT: Duration = Duration::from_millis(100);
+const MIN_REPORTED_WAIT: Duration = Duration::from_millis(100);
 /// Time for which two callbacks must have run in one thread before one counts as a delay of the
 /// other.
 const SAME_THREAD: Duration = Duration::from_secs(10);
@@ -74,7 +75,7 @@ impl Alarm {
             Some(value) => {
                 (self.bad, self.good) = (self.bad.saturating_add(1), 0);
                 let grown = |(known, _): (u64, u64)| value.0 > known.saturating_add(known / 2);
-                let is_new = self.bad >= BAD && self.raised.is_none_or(grown);
+                let is_new = self.bad >= EVALUATIONS_TO_RAISE && self.raised.is_none_or(grown);
                 if is_new {
                     self.raised = Some(value);
                 }
@@ -82,7 +83,7 @@ impl Alarm {
             }
             None => {
                 (self.bad, self.good) = (0, self.good.saturating_add(1));
-                self.good >= GOOD && self.raised.take().is_some()
+                self.good >= EVALUATIONS_TO_CLEAR && self.raised.take().is_some()
             }
         }
     }
@@ -117,7 +118,7 @@ pub(super) fn judge(
     load: ThreadLoad,
     at: ModelTime,
 ) -> bool {
-    let is_young = at - tracked.since < GRACE;
+    let is_young = at - tracked.since < STARTUP_GRACE;
     let unless_young = |found: Option<(u64, u64)>| found.filter(|_| !is_young);
     match tracked.figures.kind {
         Kind::Callback => {
@@ -159,7 +160,7 @@ fn slow(tracked: &Tracked, timers: &[TimerThread], at: ModelTime) -> Option<(u64
 /// Returns the 99th percentile of the callback's wait, if that is longer than its interval and the
 /// limit.
 fn wait(tracked: &Tracked, load: ThreadLoad) -> Option<(u64, u64)> {
-    let limit = interval(tracked)?.max(WAIT);
+    let limit = interval(tracked)?.max(MIN_REPORTED_WAIT);
     if tracked.recent.quantiles[DELAY].p99 <= limit {
         return None;
     }
@@ -190,7 +191,7 @@ fn exceeds(durations: &Durations, limit: Duration) -> Option<Duration> {
 }
 
 pub(super) const fn is_many(bad: u64, all: u64) -> bool {
-    bad >= LEAST && bad.saturating_mul(SHARE) > all
+    bad >= MIN_VIOLATIONS && bad.saturating_mul(MIN_VIOLATION_DIVISOR) > all
 }
 
 fn nanoseconds(duration: Duration) -> u64 {

@@ -21,11 +21,11 @@ use crate::facts::tables::{LastLateCalls, LateCallbacks, LateHistory, LongestLat
 use crate::facts::wall_clock::WallClock;
 
 /// Time after which a longer example may be replaced by a shorter one.
-const LONGEST_FOR: Duration = Duration::from_secs(3600);
+const LONGEST_CALL_LIFETIME: Duration = Duration::from_secs(3600);
 /// Time over which late calls are counted for a finding.
 const WINDOW: Duration = Duration::from_secs(60);
 /// Minimum number of late calls with one cause in that time.
-const LEAST: usize = 3;
+const MIN_LATE_CALLS: usize = 3;
 
 /// Late calls by process and callback.
 #[derive(Debug, Default)]
@@ -94,7 +94,9 @@ impl LateCalls {
     pub(super) fn judge(&mut self, at: ModelTime) -> bool {
         let mut has_changed = false;
         for lateness in self.callbacks.values_mut() {
-            let found = lateness.prevailing(at).map(|(_, calls)| (calls, 0));
+            let found = lateness
+                .most_frequent_cause(at)
+                .map(|(_, calls)| (calls, 0));
             has_changed |= lateness.alarm.judge(found);
         }
         has_changed
@@ -107,7 +109,9 @@ impl LateCalls {
             Some((lateness, calls))
         });
         raised.filter_map(move |(lateness, calls)| {
-            let ((stage, cause), _) = lateness.prevailing(at).or_else(|| lateness.last())?;
+            let ((stage, cause), _) = lateness
+                .most_frequent_cause(at)
+                .or_else(|| lateness.last())?;
             let of_cause = |example: &&Arc<LateExample>| {
                 let main = example.main.as_ref();
                 main.is_some_and(|main| (main.stage, main.cause) == (stage, cause))
@@ -165,13 +169,13 @@ impl Lateness {
         if let Some(part) = main {
             let Part { stage, cause, .. } = part;
             *self.causes.entry((stage, cause)).or_default() += 1;
-            let culprit = call.named_by(part);
+            let thread_of_part = call.named_by(part);
             Arc::make_mut(&mut self.history).push_back(LateEntry {
                 at: started,
                 stage,
                 cause,
                 total: call.total(),
-                culprit: culprit.map(OtherThread::culprit),
+                other_thread: thread_of_part.map(OtherThread::label),
             });
         }
         let example = Arc::new(LateExample {
@@ -180,14 +184,14 @@ impl Lateness {
             call,
         });
         self.latest.push_back(Arc::clone(&example));
-        self.keep_if_long(Arc::clone(&example));
+        self.keep_longest(Arc::clone(&example));
         example
     }
 
-    fn keep_if_long(&mut self, example: Arc<LateExample>) {
+    fn keep_longest(&mut self, example: Arc<LateExample>) {
         if self.longest.is_full() {
             let rank = |kept: &LateExample| {
-                let is_recent = example.at - kept.at < LONGEST_FOR;
+                let is_recent = example.at - kept.at < LONGEST_CALL_LIFETIME;
                 (is_recent, kept.call.total())
             };
             let kept = self.longest.iter().enumerate();
@@ -204,7 +208,7 @@ impl Lateness {
 
     /// Returns the most frequent cause of the window that ends at `at`, and its late calls; `None`
     /// if they are few.
-    fn prevailing(&self, at: ModelTime) -> Option<((Stage, Cause), u64)> {
+    fn most_frequent_cause(&self, at: ModelTime) -> Option<((Stage, Cause), u64)> {
         let recent = self.history.iter().rev();
         let recent = recent.take_while(|entry| at - entry.at < WINDOW);
         let mut counts: BTreeMap<(Stage, Cause), usize> = BTreeMap::new();
@@ -212,7 +216,7 @@ impl Lateness {
             *counts.entry((entry.stage, entry.cause)).or_default() += 1;
         }
         let (cause, calls) = counts.into_iter().max_by_key(|(_, calls)| *calls)?;
-        (calls >= LEAST).then_some((cause, calls as u64))
+        (calls >= MIN_LATE_CALLS).then_some((cause, calls as u64))
     }
 
     /// Returns the cause of the last late call.

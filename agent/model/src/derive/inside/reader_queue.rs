@@ -18,18 +18,18 @@ use std::time::Duration;
 
 use ros2probe_wire::Guid;
 
-use super::findings::{Alarm, GRACE, is_many};
+use super::findings::{Alarm, STARTUP_GRACE, is_many};
 use super::tracked::HALF_WINDOW;
 use crate::facts::bounded::Bounded;
 use crate::facts::model_time::ModelTime;
 use crate::facts::tables::QueueTotals;
 
 /// Maximum number of writers of one queue. A queue with more writers is not evaluated.
-const WRITERS: usize = 256;
+const MAX_WRITERS: usize = 256;
 /// Time without arrivals and takes after which no message waits.
-const QUIET: Duration = Duration::from_secs(10);
+const IDLE_TIMEOUT: Duration = Duration::from_secs(10);
 /// Maximum time by which arrivals are counted before the clock reaches their time.
-const AHEAD: Duration = Duration::from_millis(100);
+const MAX_AHEAD: Duration = Duration::from_millis(100);
 
 /// Messages that have arrived at the subscriptions of a process.
 #[derive(Clone, Debug, Default)]
@@ -120,7 +120,7 @@ impl ReaderQueue {
             taken: takes.taken,
             excluded: if is_whole { 0 } else { takes.taken },
             arrived,
-            past: [(now + AHEAD, arrived)].into_iter().collect(),
+            past: [(now + MAX_AHEAD, arrived)].into_iter().collect(),
             lost: 0,
             has_begun: is_whole,
             changed: now,
@@ -164,14 +164,14 @@ impl ReaderQueue {
             let known = self.past.iter().rev().find(is_before);
             gone = gone.max(known.map_or(0, |(_, arrived)| *arrived));
         }
-        let quiet = QUIET.max(self.longest_gap.saturating_mul(3));
+        let quiet = IDLE_TIMEOUT.max(self.longest_gap.saturating_mul(3));
         let is_after = arrivals.last.is_some_and(|arrival| takes.last > arrival);
         if is_after && now - self.changed >= quiet {
             gone = self.arrived;
         }
         let lost = gone.saturating_sub(taken).saturating_sub(self.lost);
         self.lost += lost;
-        self.past.push_back((now + AHEAD, self.arrived));
+        self.past.push_back((now + MAX_AHEAD, self.arrived));
         lost
     }
 
@@ -179,7 +179,7 @@ impl ReaderQueue {
     pub(super) fn judge(&mut self, now: ModelTime) -> bool {
         let [(_, arrived, lost), (middle, ..)] = self.marks;
         let (arrived, lost) = (self.arrived - arrived, self.lost - lost);
-        let found = (arrived > 0 && is_many(lost, arrived) && now - self.since >= GRACE)
+        let found = (arrived > 0 && is_many(lost, arrived) && now - self.since >= STARTUP_GRACE)
             .then(|| (lost.saturating_mul(1000) / arrived.max(1), arrived));
         if now - middle >= HALF_WINDOW {
             self.marks = [self.marks[1], (now, self.arrived, self.lost)];
@@ -236,7 +236,7 @@ impl ReaderQueue {
 impl Arrivals {
     /// Returns whether the arrivals at this number of subscriptions can be compared.
     pub(super) fn is_comparable(&self, subscriptions: usize) -> bool {
-        self.readers.len() == subscriptions && self.writers.len() <= WRITERS
+        self.readers.len() == subscriptions && self.writers.len() <= MAX_WRITERS
     }
 }
 

@@ -44,7 +44,7 @@ impl Inside {
                     }
                     None => ReaderQueue::new(&arrivals, &takes, now),
                 };
-                self.topics.lose(&key, lost);
+                self.topics.add_queue_losses(&key, lost);
                 process.queues.insert(key, queue);
             }
             // The remaining queues can no longer be compared, so their findings end.
@@ -129,7 +129,7 @@ impl Process {
             let takes = takes.or_insert_with(|| Takes {
                 handles: Vec::new(),
                 taken: 0,
-                since: self.born,
+                since: self.counted_since,
                 published: tracked.published,
                 last: tracked.figures.last,
             });

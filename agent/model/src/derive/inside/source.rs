@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use crate::facts::model_time::ModelTime;
 /// Maximum time by which publications may be ahead of the network's messages.
-const AHEAD: Duration = Duration::from_secs(2);
+const MAX_LEAD: Duration = Duration::from_secs(2);
 
 /// Where a topic's counts come from.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -74,7 +74,7 @@ impl Choice {
         let source = match (wire.last, inside.last) {
             (_, None) => Source::Wire,
             (None, Some(_)) => Source::Inside,
-            (Some(wire), Some(inside)) if inside - wire > AHEAD => Source::Inside,
+            (Some(wire), Some(inside)) if inside - wire > MAX_LEAD => Source::Inside,
             (Some(_), Some(_)) => Source::Wire,
         };
         if source != self.source {

@@ -34,7 +34,7 @@ use crate::measure::receivers::Receivers;
 use crate::measure::topic::TopicId;
 
 /// Time without a report after which the source counts as stopped.
-const STALE: Duration = Duration::from_secs(10);
+const REPORT_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// Processes, handles and topics that reports have shown.
 #[derive(Debug, Default)]
@@ -64,7 +64,7 @@ pub(super) struct Process {
     pub(super) facts: ObservedProcess,
     /// Time of the report before the first one with this process: all its calls since then are
     /// counted.
-    pub(super) born: Option<ModelTime>,
+    pub(super) counted_since: Option<ModelTime>,
     /// Its participants.
     pub(super) participants: BTreeSet<GuidPrefix>,
     /// Its domain according to its environment.
@@ -149,7 +149,7 @@ impl Inside {
     /// Drops topics after their grace period, and all handles if the source has stopped.
     pub fn advance(&mut self, now: ModelTime, grace: Duration) {
         self.topics.expire(now, grace);
-        if self.at.is_some_and(|at| now - at >= STALE) {
+        if self.at.is_some_and(|at| now - at >= REPORT_TIMEOUT) {
             self.detach();
         }
     }
@@ -301,7 +301,7 @@ impl Inside {
             },
             reported_domain_id: report.domain_id,
             reported: Bounded::default(),
-            born: began,
+            counted_since: began,
             participants: BTreeSet::new(),
             cpu: report.cpu,
             marks: [mark, mark],
@@ -612,7 +612,7 @@ impl Inside {
             calls: late.calls,
             stage: late.stage,
             cause: late.cause,
-            by: by.map(OtherThread::culprit),
+            by: by.map(OtherThread::label),
             longest: call.total(),
         }
     }

@@ -146,7 +146,7 @@ impl InsideTopics {
 
     /// Adds messages lost in the queues of subscriptions. A count of 0 marks the queues as
     /// evaluated.
-    pub(super) fn lose(&mut self, key: &(DomainId, TopicName), lost: u64) {
+    pub(super) fn add_queue_losses(&mut self, key: &(DomainId, TopicName), lost: u64) {
         if let Some(topic) = self.topics.get_mut(key) {
             *topic.lost_in_queues.get_or_insert_default() += lost;
         }

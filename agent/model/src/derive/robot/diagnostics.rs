@@ -8,7 +8,7 @@ use ros2probe_wire::diagnostics::{self as wire, DiagnosticLevel, DiagnosticStatu
 use ros2probe_wire::{DomainId, Guid, SequenceNumber, WireError};
 
 use super::Origin;
-use super::text::bounded;
+use super::text::truncated_text;
 use crate::facts::bounded::{Bounded, Counted, Sum, TableFacts};
 use crate::facts::diagnosis::Diagnosis;
 use crate::facts::event::{EventKind, Events};
@@ -18,17 +18,17 @@ use crate::facts::robot::DiagnosticStatus;
 use crate::facts::tables::{DiagnosticValueBytes, DiagnosticsTable};
 
 /// Maximum length of a name, a hardware id and a key, in bytes.
-const NAME: usize = 128;
+const MAX_NAME: usize = 128;
 /// Maximum length of a message and a value, in bytes.
-const TEXT: usize = 256;
+const MAX_TEXT: usize = 256;
 /// Maximum number of values of one status.
-const VALUES: usize = 64;
+const MAX_STATUS_VALUES: usize = 64;
 /// A status is stale after this silence, if it came more often.
-const SILENCE: Duration = Duration::from_secs(5);
+const MIN_STALE_SILENCE: Duration = Duration::from_secs(5);
 /// A status that came once is stale after this silence.
-const SILENCE_OF_ONE: Duration = Duration::from_secs(120);
+const SINGLE_STATUS_SILENCE: Duration = Duration::from_secs(120);
 /// A part is reported when it has been in error or stale for this time.
-const PATIENCE: Duration = Duration::from_secs(5);
+const FAULT_DELAY: Duration = Duration::from_secs(5);
 
 /// Domain, topic, name and hardware id.
 type Key = (DomainId, TopicName, Arc<str>, Arc<str>);
@@ -93,8 +93,8 @@ impl Diagnostics {
         status: &wire::DiagnosticStatus<'_>,
         events: &mut Events,
     ) {
-        let name = bounded(status.name, NAME).into();
-        let hardware_id = bounded(status.hardware_id, NAME).into();
+        let name = truncated_text(status.name, MAX_NAME).into();
+        let hardware_id = truncated_text(status.hardware_id, MAX_NAME).into();
         let key = (origin.domain_id, origin.topic.clone(), name, hardware_id);
         if let Some((_, silent)) = self.parts.make_room(&key, |part| part.status.at) {
             self.removed(&silent);
@@ -121,7 +121,7 @@ impl Diagnostics {
             node: origin.node.cloned(),
             writer: origin.writer,
             level,
-            message: bounded(status.message, TEXT).into(),
+            message: truncated_text(status.message, MAX_TEXT).into(),
             values: self.values(status),
             at: origin.at,
             since,
@@ -144,10 +144,13 @@ impl Diagnostics {
     fn values(&mut self, status: &wire::DiagnosticStatus<'_>) -> Vec<(Box<str>, Box<str>)> {
         let mut values = Vec::new();
         let mut bytes = 0;
-        for (key, value) in status.values.clone().take(VALUES) {
-            let (key, value) = (bounded(key, NAME), bounded(value, TEXT));
+        for (key, value) in status.values.clone().take(MAX_STATUS_VALUES) {
+            let (key, value) = (
+                truncated_text(key, MAX_NAME),
+                truncated_text(value, MAX_TEXT),
+            );
             bytes += key.len() + value.len();
-            if bytes > self.value_bytes.room() {
+            if bytes > self.value_bytes.remaining() {
                 self.value_bytes.refuse();
                 return Vec::new();
             }
@@ -188,8 +191,8 @@ impl Diagnostics {
     ) {
         for part in self.parts.values_mut() {
             let silence = match part.interval {
-                Some(interval) => SILENCE.max(interval * 3),
-                None => SILENCE_OF_ONE,
+                Some(interval) => MIN_STALE_SILENCE.max(interval * 3),
+                None => SINGLE_STATUS_SILENCE,
             };
             let status = &part.status;
             if status.level != DiagnosticLevel::Stale
@@ -254,7 +257,7 @@ impl Part {
             since: status.since,
             reported: None,
         });
-        let is_new = fault.reported.is_none() && now - fault.since >= PATIENCE;
+        let is_new = fault.reported.is_none() && now - fault.since >= FAULT_DELAY;
         if is_new {
             fault.reported = Some(Diagnosis::DiagnosticError {
                 domain_id: status.domain_id,

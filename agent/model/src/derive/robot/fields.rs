@@ -15,7 +15,7 @@ use crate::facts::tables::{FieldBytes, FieldMessages};
 use crate::graph::discovery::Discovery;
 
 /// `sensor_msgs/msg/BatteryState`, whose fields have metrics on every robot.
-pub const BATTERY: &str = "sensor_msgs/msg/BatteryState";
+pub const BATTERY_TYPE: &str = "sensor_msgs/msg/BatteryState";
 
 /// The last message of each writer.
 #[derive(Debug, Default)]
@@ -59,13 +59,13 @@ impl Fields {
 
     /// Returns whether messages of this topic are kept.
     pub(super) fn cover(&self, topic: &TopicName, message_type: &TypeName) -> bool {
-        message_type.as_str() == BATTERY || self.topics.contains(topic)
+        message_type.as_str() == BATTERY_TYPE || self.topics.contains(topic)
     }
 
     /// Keeps a message instead of the last one of its writer, if there is room.
     pub(super) fn add(&mut self, origin: &Origin<'_>, payload: &[u8]) {
         self.forget(origin.writer);
-        if payload.len() > self.bytes.room() {
+        if payload.len() > self.bytes.remaining() {
             self.bytes.refuse();
             return;
         }

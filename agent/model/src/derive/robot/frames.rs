@@ -7,8 +7,8 @@ use std::time::Duration;
 use foldhash::HashMap;
 use ros2probe_wire::{DomainId, Guid, header};
 
-use super::text::bounded;
-use super::transforms::{NAME, NAMED, Transforms, without_slash};
+use super::text::truncated_text;
+use super::transforms::{MAX_NAMED, NAME, Transforms, without_slash};
 use crate::facts::bounded::{Bounded, Counted, TableFacts};
 use crate::facts::diagnosis::Diagnosis;
 use crate::facts::model_time::ModelTime;
@@ -17,7 +17,7 @@ use crate::facts::robot::{TransformFault, TransformFaultKind};
 use crate::facts::tables::FrameWriters;
 
 /// Time for which no transform may have a frame.
-const UNKNOWN: Duration = Duration::from_secs(8);
+const UNKNOWN_FRAME_TIMEOUT: Duration = Duration::from_secs(8);
 
 /// Writers of messages with a header.
 #[derive(Debug, Default)]
@@ -66,7 +66,7 @@ impl Frames {
     pub(super) fn read(&mut self, writer: Guid, payload: &[u8]) {
         if let Some(known) = self.writers.get_mut(&writer) {
             let frame = header::frame_id(payload).unwrap_or_default();
-            known.frame = Some(without_slash(&bounded(frame, NAME)).into());
+            known.frame = Some(without_slash(&truncated_text(frame, NAME)).into());
         }
     }
 
@@ -75,12 +75,14 @@ impl Frames {
         let mut unknown: BTreeMap<(DomainId, &Arc<str>), Vec<&TopicName>> = BTreeMap::new();
         for writer in self.writers.values_mut() {
             let frame = writer.frame.as_ref().filter(|frame| !frame.is_empty());
-            let Some(frame) = frame.filter(|frame| transforms.lack(writer.domain_id, frame)) else {
+            let Some(frame) =
+                frame.filter(|frame| transforms.is_unknown_frame(writer.domain_id, frame))
+            else {
                 writer.unknown = None;
                 continue;
             };
             let since = *writer.unknown.get_or_insert(now);
-            if now - since >= UNKNOWN {
+            if now - since >= UNKNOWN_FRAME_TIMEOUT {
                 let topics = unknown.entry((writer.domain_id, frame)).or_default();
                 topics.push(&writer.topic);
             }
@@ -88,7 +90,7 @@ impl Frames {
         let faults = unknown.into_iter().map(|((domain_id, frame), mut topics)| {
             topics.sort_unstable();
             topics.dedup();
-            let names = topics.iter().take(NAMED);
+            let names = topics.iter().take(MAX_NAMED);
             Diagnosis::TransformFault {
                 domain_id,
                 namespace: Arc::default(),

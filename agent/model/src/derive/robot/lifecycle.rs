@@ -16,7 +16,7 @@ use crate::facts::names::NodeName;
 use crate::facts::tables::ManagedNodes;
 
 /// Time for which a node may be in another state than active.
-const GRACE: Duration = Duration::from_secs(5);
+const INACTIVE_GRACE: Duration = Duration::from_secs(5);
 
 /// The managed nodes of all robots.
 #[derive(Debug, Default)]
@@ -130,7 +130,7 @@ impl Lifecycle {
             let is_expected = self.active.iter().any(|pattern| covers_text(pattern, name));
             let is_fault = managed.state != LifecycleState::Active
                 && (is_expected || managed.has_failed)
-                && now - managed.at >= GRACE;
+                && now - managed.at >= INACTIVE_GRACE;
             let fault = is_fault.then(|| Diagnosis::NodeInactive {
                 domain_id: *domain_id,
                 node: name.clone(),

@@ -7,7 +7,7 @@ use ros2probe_wire::log::{Log, LogLevel};
 use ros2probe_wire::{DomainId, Guid, SequenceNumber};
 
 use super::Origin;
-use super::text::bounded;
+use super::text::truncated_text;
 use crate::facts::bounded::{Bounded, Counted, TableFacts};
 use crate::facts::diagnosis::Diagnosis;
 use crate::facts::model_time::ModelTime;
@@ -15,13 +15,13 @@ use crate::facts::names::NodeName;
 use crate::facts::tables::{FreshLogMessages, LogMessages, LogNodes};
 
 /// Maximum length of a message's text, in bytes.
-const TEXT: usize = 512;
+const MAX_TEXT: usize = 512;
 /// Maximum length of its other texts, in bytes.
-const NAME: usize = 128;
+const MAX_NAME: usize = 128;
 /// Seconds in which errors are counted.
-const WINDOW: usize = 60;
+const WINDOW_SECONDS: usize = 60;
 /// Errors within the window that are a burst. A fatal error is one.
-const BURST: u32 = 10;
+const MIN_BURST_ERRORS: u32 = 10;
 
 /// The logs of all nodes.
 #[derive(Debug, Default)]
@@ -72,7 +72,7 @@ struct NodeLog {
     /// Time of the last message.
     at: ModelTime,
     /// Errors by second, the current one last.
-    errors: [u32; WINDOW],
+    errors: [u32; WINDOW_SECONDS],
     burst: Option<Burst>,
 }
 
@@ -124,7 +124,7 @@ pub struct LogFacts {
 impl Logs {
     /// Adds a message.
     pub fn add(&mut self, origin: &Origin<'_>, log: &Log<'_>) {
-        let logger = bounded(log.logger, NAME);
+        let logger = truncated_text(log.logger, MAX_NAME);
         let node = match origin.node {
             Some(node) => node.clone(),
             None => NodeName::from(format!("/{}", logger.replace('.', "/"))),
@@ -138,9 +138,9 @@ impl Logs {
             node: node.clone(),
             level: log.level,
             logger,
-            text: bounded(log.text, TEXT),
-            file: bounded(log.file, NAME),
-            function: bounded(log.function, NAME),
+            text: truncated_text(log.text, MAX_TEXT),
+            file: truncated_text(log.file, MAX_NAME),
+            function: truncated_text(log.function, MAX_NAME),
             line: log.line,
         });
         self.latest.push_back(Arc::clone(&message));
@@ -221,7 +221,7 @@ impl Default for NodeLog {
         Self {
             levels: Default::default(),
             at: ModelTime::ZERO,
-            errors: [0; WINDOW],
+            errors: [0; WINDOW_SECONDS],
             burst: None,
         }
     }
@@ -237,7 +237,7 @@ impl NodeLog {
         }
         let begins = self.burst.is_none()
             && level >= LogLevel::Error
-            && (level == LogLevel::Fatal || self.recent() >= BURST);
+            && (level == LogLevel::Fatal || self.recent() >= MIN_BURST_ERRORS);
         if begins {
             self.burst = Some(Burst {
                 errors: self.recent().into(),

@@ -11,7 +11,7 @@ use ros2probe_wire::ros_parameters::{
 use ros2probe_wire::{DomainId, Guid, SequenceNumber, WireError};
 
 use super::Origin;
-use super::text::bounded;
+use super::text::truncated_text;
 use crate::derive::services::service::CallId;
 use crate::facts::bounded::{Bounded, Counted, TableFacts};
 use crate::facts::diagnosis::Diagnosis;
@@ -24,18 +24,18 @@ use crate::facts::tables::{
 };
 
 /// Maximum length of a name, in bytes.
-const NAME: usize = 128;
+const MAX_NAME: usize = 128;
 /// Maximum length of a value, in bytes.
-const VALUE: usize = 256;
+const MAX_VALUE: usize = 256;
 /// Time after a request in which a change counts as its effect.
-const EFFECT: Duration = Duration::from_secs(5);
+const MAX_EFFECT_DELAY: Duration = Duration::from_secs(5);
 
 /// Parameter with which a node uses simulated time.
 const SIMULATED_TIME: &str = "use_sim_time";
 /// Time for which nodes may have different clocks.
-const MIXED: Duration = Duration::from_secs(5);
+const MIXED_TIME_GRACE: Duration = Duration::from_secs(5);
 /// Maximum number of nodes that a finding names.
-const NAMED: usize = 4;
+const MAX_NAMED_NODES: usize = 4;
 
 /// Domain, node and name.
 type Key = (DomainId, NodeName, Arc<str>);
@@ -49,7 +49,7 @@ pub struct Parameters {
     /// The latest requests, oldest first.
     requests: Bounded<Counted<ParameterRequests>, VecDeque<Request>>,
     /// Parameters in the latest requests for values, oldest first.
-    asked: Bounded<Counted<AskedParameters>, VecDeque<Asked>>,
+    requested_values: Bounded<Counted<AskedParameters>, VecDeque<RequestedParameter>>,
     /// Changes of each node since the agent started.
     counts: Bounded<Counted<ChangedNodes>, BTreeMap<(DomainId, NodeName), u64>>,
     /// What the configuration expects.
@@ -94,7 +94,7 @@ struct Request {
 
 /// A parameter in a request for values.
 #[derive(Clone, Debug)]
-struct Asked {
+struct RequestedParameter {
     call: CallId,
     /// Its place in the request and in the reply.
     index: usize,
@@ -153,7 +153,7 @@ impl Parameters {
             .retain(|domain_id, _| clocks.contains_key(domain_id));
         for (domain_id, [simulated, system]) in clocks {
             let since = *self.mixed.entry(domain_id).or_insert(now);
-            if now - since >= MIXED {
+            if now - since >= MIXED_TIME_GRACE {
                 findings.push(Diagnosis::MixedTime {
                     domain_id,
                     simulated,
@@ -193,7 +193,7 @@ impl Parameters {
                 } else {
                     system
                 };
-                if nodes.len() < NAMED {
+                if nodes.len() < MAX_NAMED_NODES {
                     nodes.push(node.clone());
                 }
             }
@@ -222,10 +222,10 @@ impl Parameters {
         event: ParameterEvent<'_>,
         events: &mut Events,
     ) -> Result<(), WireError> {
-        let node = NodeName::from(&*bounded(event.node, NAME));
+        let node = NodeName::from(&*truncated_text(event.node, MAX_NAME));
         for change in event.changes {
             let change = change?;
-            let name = bounded(change.parameter.name, NAME).into();
+            let name = truncated_text(change.parameter.name, MAX_NAME).into();
             let key = (origin.domain_id, node.clone(), name);
             self.change(origin, key, &change, events);
         }
@@ -248,7 +248,7 @@ impl Parameters {
         self.has_changed = true;
         let value = (kind != ChangeKind::Deleted).then(|| text(&change.parameter.value));
         match &value {
-            Some(value) => self.know(origin, key.clone(), Arc::clone(value)),
+            Some(value) => self.set_value(origin, key.clone(), Arc::clone(value)),
             None => {
                 self.known.remove(&key);
             }
@@ -276,7 +276,7 @@ impl Parameters {
     }
 
     /// Records the last known value of a parameter.
-    fn know(&mut self, origin: &Origin<'_>, key: Key, value: Arc<str>) {
+    fn set_value(&mut self, origin: &Origin<'_>, key: Key, value: Arc<str>) {
         let known = Known {
             value,
             at: origin.at,
@@ -292,7 +292,7 @@ impl Parameters {
     ///
     /// # Errors
     /// Fails if the request is malformed. The names before the error are added.
-    pub fn ask(
+    pub fn add_get_request(
         &mut self,
         call: Option<CallId>,
         names: RequestedNames<'_>,
@@ -301,8 +301,9 @@ impl Parameters {
             return Ok(());
         };
         for (index, name) in names.enumerate() {
-            let name = bounded(name?, NAME).into();
-            self.asked.push_back(Asked { call, index, name });
+            let name = truncated_text(name?, MAX_NAME).into();
+            self.requested_values
+                .push_back(RequestedParameter { call, index, name });
         }
         Ok(())
     }
@@ -322,7 +323,7 @@ impl Parameters {
             return Ok(());
         };
         let mut names = BTreeMap::new();
-        self.asked.retain(|asked| {
+        self.requested_values.retain(|asked| {
             if asked.call == call {
                 names.insert(asked.index, Arc::clone(&asked.name));
             }
@@ -337,7 +338,7 @@ impl Parameters {
                 matches!(value, ParameterValue::NotSet),
             ) {
                 let key = (origin.domain_id, node.clone(), name);
-                self.know(origin, key, text(&value));
+                self.set_value(origin, key, text(&value));
             }
         }
         Ok(())
@@ -358,7 +359,7 @@ impl Parameters {
         let node = NodeName::from(node);
         for parameter in parameters {
             let parameter = parameter?;
-            let name = bounded(parameter.name, NAME).into();
+            let name = truncated_text(parameter.name, MAX_NAME).into();
             self.requests.push_back(Request {
                 key: (origin.domain_id, node.clone(), name),
                 value: text(&parameter.value),
@@ -375,7 +376,8 @@ impl Parameters {
     /// Returns who requested a change to this value.
     fn requester(&self, key: &Key, value: Option<&Arc<str>>, at: ModelTime) -> Option<Requester> {
         let latest = self.requests.iter().rev();
-        let mut recent = latest.filter(|request| request.at <= at && at - request.at <= EFFECT);
+        let mut recent =
+            latest.filter(|request| request.at <= at && at - request.at <= MAX_EFFECT_DELAY);
         let removal = text(&ParameterValue::NotSet);
         let cause = recent
             .find(|request| request.key == *key && request.value == *value.unwrap_or(&removal));
@@ -420,7 +422,7 @@ impl Parameters {
             self.known.facts(),
             self.changes.facts(),
             self.requests.facts(),
-            self.asked.facts(),
+            self.requested_values.facts(),
             self.counts.facts(),
         ]
     }
@@ -439,7 +441,7 @@ struct Truncated(String);
 
 impl std::fmt::Write for Truncated {
     fn write_str(&mut self, more: &str) -> std::fmt::Result {
-        let room = VALUE - self.0.len().min(VALUE);
+        let room = MAX_VALUE - self.0.len().min(MAX_VALUE);
         let fitting = more
             .get(..more.floor_char_boundary(room))
             .unwrap_or_default();

@@ -14,7 +14,7 @@ use ros2probe_wire::transforms::{Transform, Transforms as Message};
 use ros2probe_wire::{DomainId, Guid, WireError};
 
 use super::Origin;
-use super::text::bounded;
+use super::text::truncated_text;
 use crate::facts::bounded::{Bounded, Counted, Sum, TableFacts};
 use crate::facts::diagnosis::Diagnosis;
 use crate::facts::event::{EventKind, Events};
@@ -29,7 +29,7 @@ pub(super) const NAME: usize = 128;
 /// Time for which trees stay apart before that is a fault.
 const APART: Duration = Duration::from_secs(10);
 /// Maximum number of roots that a fault names.
-pub(super) const NAMED: usize = 4;
+pub(super) const MAX_NAMED: usize = 4;
 
 /// The transforms of all robots.
 #[derive(Debug, Default)]
@@ -47,7 +47,7 @@ pub struct Transforms {
 struct StaticBroadcaster {
     domain_id: DomainId,
     namespace: Arc<str>,
-    is_heard: bool,
+    is_received: bool,
 }
 
 /// The frames of one domain and namespace.
@@ -94,7 +94,7 @@ impl Transforms {
             let new = || StaticBroadcaster {
                 domain_id,
                 namespace: namespace.into(),
-                is_heard: false,
+                is_received: false,
             };
             self.broadcasters.get_or_insert_with(writer, new);
         }
@@ -112,7 +112,7 @@ impl Transforms {
     ) -> Result<(), WireError> {
         let (namespace, is_static) = namespace(origin.topic);
         if let Some(broadcaster) = self.broadcasters.get_mut(&origin.writer) {
-            broadcaster.is_heard = true;
+            broadcaster.is_received = true;
         }
         let is_this =
             |tree: &Tree| (tree.domain_id, &*tree.namespace) == (origin.domain_id, namespace);
@@ -162,21 +162,21 @@ impl Transforms {
             };
             let mut static_broadcasters = self.broadcasters.values();
             // Without all static transforms, a tree only seems to be in parts.
-            let is_whole = static_broadcasters.all(|each| each.is_heard || !of_tree(each));
+            let is_whole = static_broadcasters.all(|each| each.is_received || !of_tree(each));
             if tree.end_second(now, is_whole, &is_paused) {
                 self.revision += 1;
             }
         }
     }
 
-    /// Returns whether the domain has transforms, and none of them has this frame. A static one that
-    /// was sent before the agent started may have it.
-    pub(super) fn lack(&self, domain_id: DomainId, frame: &str) -> bool {
+    /// Returns whether the domain has transforms, and none of them has this frame. A static one
+    /// that was sent before the agent started may have it.
+    pub(super) fn is_unknown_frame(&self, domain_id: DomainId, frame: &str) -> bool {
         let of_domain = || self.trees.iter().filter(|tree| tree.domain_id == domain_id);
         let mut unread = self.broadcasters.values();
         of_domain().next().is_some()
             && !of_domain().any(|tree| tree.has(frame))
-            && unread.all(|each| each.is_heard || each.domain_id != domain_id)
+            && unread.all(|each| each.is_received || each.domain_id != domain_id)
     }
 
     /// Returns the number of changes of [`Self::findings`].
@@ -210,7 +210,7 @@ impl Transforms {
                 unread_static: 0,
             })
             .collect();
-        for unread in self.broadcasters.values().filter(|each| !each.is_heard) {
+        for unread in self.broadcasters.values().filter(|each| !each.is_received) {
             let key = (unread.domain_id, &unread.namespace);
             match trees
                 .iter_mut()
@@ -259,7 +259,7 @@ impl Tree {
                     edges.refuse();
                     return;
                 }
-                let child: Arc<str> = without_slash(&bounded(transform.child, NAME)).into();
+                let child: Arc<str> = without_slash(&truncated_text(transform.child, NAME)).into();
                 let edge = self.edges.entry(child).or_default();
                 edges.add(usize::from(edge.is_new()));
                 edge
@@ -268,7 +268,7 @@ impl Tree {
         let Some(jump) = edge.add(origin, transform, is_static) else {
             return;
         };
-        let child = bounded(transform.child, NAME);
+        let child = truncated_text(transform.child, NAME);
         events.push(
             origin.at,
             EventKind::TransformJump {
@@ -320,7 +320,7 @@ impl Tree {
                         parent: Arc::default(),
                         kind: TransformFaultKind::Apart,
                         edges: 0,
-                        names: self.roots.iter().take(NAMED).cloned().collect(),
+                        names: self.roots.iter().take(MAX_NAMED).cloned().collect(),
                     });
                 }
             }

@@ -15,7 +15,7 @@ use crate::facts::tables::{ReplyRuns, ServiceClients};
 /// Number of request numbers that are remembered per client, to recognise late duplicates.
 const WINDOW: u64 = 64;
 /// A number further ahead does not move a client's highest number, since it may be forged.
-const FAR: u64 = 1 << 20;
+const MAX_SEQUENCE_JUMP: u64 = 1 << 20;
 /// Time after which an unanswered call is no longer followed.
 const FORGOTTEN_AFTER: Duration = Duration::from_secs(600);
 
@@ -30,7 +30,7 @@ pub struct CallId {
 
 /// Where and when a request or reply was seen.
 #[derive(Clone, Copy, Debug)]
-pub struct Sighting {
+pub struct Capture {
     /// Time.
     pub at: ModelTime,
     /// Cookie of the socket; 0 = not seen at a socket.
@@ -108,7 +108,7 @@ struct Call {
 #[derive(Debug, Default)]
 struct Received {
     /// Writer and number of the reply.
-    of: Option<(Guid, SequenceNumber)>,
+    reply: Option<(Guid, SequenceNumber)>,
     /// Sorted half-open ranges of fragment numbers.
     runs: Bounded<ReplyRuns, Vec<(u32, u32)>>,
 }
@@ -128,7 +128,7 @@ impl Service {
         &mut self,
         id: CallId,
         writer: Guid,
-        sighting: Sighting,
+        sighting: Capture,
         goal: Option<[u8; 16]>,
     ) -> bool {
         let is_local = sighting.position == Position::Leaving;
@@ -165,7 +165,7 @@ impl Service {
         id: CallId,
         writer: Guid,
         sample: &Sample,
-        sighting: Sighting,
+        sighting: Capture,
     ) -> Option<Answered> {
         let call = self.calls.get_mut(&id)?;
         match sighting.position {
@@ -230,7 +230,7 @@ impl Service {
 
     /// Drops the oldest call of one client, because the search for the oldest call of all is too
     /// expensive in a flood of requests. Returns whether there was a call.
-    pub fn forget_one(&mut self) -> bool {
+    pub fn drop_oldest_call(&mut self) -> bool {
         self.calls.pop_first().is_some()
     }
 
@@ -272,7 +272,7 @@ impl Client {
         }
         if number > self.highest {
             let ahead = number - self.highest;
-            if ahead > FAR {
+            if ahead > MAX_SEQUENCE_JUMP {
                 return true;
             }
             self.seen = if ahead >= WINDOW {
@@ -300,8 +300,8 @@ impl Received {
             return true;
         };
         let of = Some((writer, sample.sequence_number));
-        if self.of != of {
-            (self.of, self.runs) = (of, Bounded::default());
+        if self.reply != of {
+            (self.reply, self.runs) = (of, Bounded::default());
         }
         let total = fragments.total();
         if total == 0 {

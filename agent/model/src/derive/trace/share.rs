@@ -1,7 +1,7 @@
 //! The share of traces that are exported, decided by their ids as OpenTelemetry's samplers do.
 
 /// The bits of a trace id that decide whether the trace is exported.
-const RANDOM: u64 = (1 << 56) - 1;
+const RANDOM_BITS: u64 = (1 << 56) - 1;
 
 /// A share above 0. A larger share contains all traces of a smaller one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -22,13 +22,13 @@ impl Share {
             clippy::cast_precision_loss,
             reason = "a part of 2^56"
         )]
-        let threshold = ((1.0 - ratio.min(1.0)) * RANDOM as f64) as u64;
+        let threshold = ((1.0 - ratio.min(1.0)) * RANDOM_BITS as f64) as u64;
         Some(Self { threshold })
     }
 
     /// Returns whether the share contains this trace.
     #[must_use]
     pub const fn takes(self, trace_id: u128) -> bool {
-        trace_id as u64 & RANDOM >= self.threshold
+        trace_id as u64 & RANDOM_BITS >= self.threshold
     }
 }

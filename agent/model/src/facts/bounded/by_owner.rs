@@ -12,9 +12,9 @@ use super::TableFacts;
 use super::ledger;
 
 /// Bytes of an allocation besides its content: header, rounding, and the counters of an `Arc`.
-const ALLOCATION: usize = 32;
+const ALLOCATION_OVERHEAD: usize = 32;
 /// Bytes of an owner without entries, in the tree of owners and in the order of their shares.
-const OWNER: usize = 256;
+const OWNER_OVERHEAD: usize = 256;
 
 /// Bytes of a value on the heap.
 pub trait HeapBytes {
@@ -54,7 +54,7 @@ impl HeapBytes for ros2probe_wire::zenoh::ZenohId {
 
 impl HeapBytes for Arc<str> {
     fn heap_bytes(&self) -> usize {
-        ALLOCATION + self.len()
+        ALLOCATION_OVERHEAD + self.len()
     }
 }
 
@@ -92,10 +92,10 @@ impl<D: Declared, O: Ord + Copy, K: Ord + HeapBytes, V: HeapBytes> ByOwner<D, O,
         let own = 2 * size_of::<(K, V, usize)>() + key.heap_bytes() + value.heap_bytes() + beside;
         let of_owner = match self.shares.get(&owner) {
             Some(share) => share.bytes,
-            None => OWNER,
+            None => OWNER_OVERHEAD,
         };
         let is_new = !self.shares.contains_key(&owner);
-        let needed = if is_new { own + OWNER } else { own };
+        let needed = if is_new { own + OWNER_OVERHEAD } else { own };
         while self.entries >= D::TABLE.entries || self.bytes + needed > Self::BYTES {
             if !self.make_room(of_owner + own) {
                 self.count();
@@ -104,7 +104,7 @@ impl<D: Declared, O: Ord + Copy, K: Ord + HeapBytes, V: HeapBytes> ByOwner<D, O,
         }
         let share = self.shares.entry(owner).or_insert_with(|| Share {
             entries: BTreeMap::new(),
-            bytes: OWNER,
+            bytes: OWNER_OVERHEAD,
         });
         self.by_bytes.remove(&(share.bytes, owner));
         share.bytes += own;

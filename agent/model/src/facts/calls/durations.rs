@@ -11,7 +11,7 @@ use ros2probe_wire::inside::{BUCKETS, bucket, bucket_start};
 use crate::facts::histogram::Histogram;
 
 /// Number of values of a bucket's count in the kernel, after which it wraps to zero.
-const WRAP: u64 = 1 << 32;
+const COUNT_WRAP: u64 = 1 << 32;
 
 /// A distribution of durations.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -147,9 +147,9 @@ impl Durations {
     pub fn continue_from(&mut self, earlier: &Self) {
         let mut is_wrapped = false;
         for (count, before) in self.counts.iter_mut().zip(earlier.counts.iter()) {
-            let added = (*count % WRAP + WRAP - before % WRAP) % WRAP;
+            let added = (*count % COUNT_WRAP + COUNT_WRAP - before % COUNT_WRAP) % COUNT_WRAP;
             // A larger difference means another object at the same address.
-            if *count < *before && added < WRAP / 2 {
+            if *count < *before && added < COUNT_WRAP / 2 {
                 *count = before.saturating_add(added);
                 is_wrapped = true;
             }

@@ -7,7 +7,7 @@ use std::time::Duration;
 use ros2probe_wire::{DomainId, Guid};
 
 use super::late::{Cause, LateCall, Part, Stage};
-use super::other_thread::Culprit;
+use super::other_thread::ThreadLabel;
 use super::report::{Durations, ThreadStates, Trigger};
 use crate::facts::bounded::Bounded;
 use crate::facts::model_time::ModelTime;
@@ -247,7 +247,7 @@ pub struct LateEntry {
     /// Time from ready to the end of the call.
     pub total: Duration,
     /// Thread that ran instead for longest, released the lock, or continued the process.
-    pub culprit: Option<Culprit>,
+    pub other_thread: Option<ThreadLabel>,
 }
 
 /// Late calls since the last output.

@@ -35,7 +35,7 @@ pub enum Priority {
 
 /// A thread by name, where its id does not matter: it made calls late repeatedly.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub struct Culprit {
+pub struct ThreadLabel {
     /// Name of the thread.
     pub name: Arc<str>,
     /// As in [`OtherThread`].
@@ -45,8 +45,8 @@ pub struct Culprit {
 impl OtherThread {
     /// Returns the thread without its ids.
     #[must_use]
-    pub fn culprit(&self) -> Culprit {
-        Culprit {
+    pub fn label(&self) -> ThreadLabel {
+        ThreadLabel {
             name: Arc::clone(&self.name),
             unit: self.unit.clone(),
         }
@@ -67,7 +67,7 @@ impl fmt::Display for OtherThread {
     }
 }
 
-impl fmt::Display for Culprit {
+impl fmt::Display for ThreadLabel {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         match &self.unit {
             Some(unit) => write!(out, "{} ({unit})", self.name),

@@ -17,8 +17,8 @@ impl LateCall {
     /// [`Self::total`].
     ///
     /// The sums are those of the scheduler's accounting. The events divide them: events can get
-    /// lost, and the accounting cannot. Only the CPU time is that of the events, if none is missing:
-    /// the accounting counts it by ticks.
+    /// lost, and the accounting cannot. Only the CPU time is that of the events, if none is
+    /// missing: the accounting counts it by ticks.
     #[must_use]
     pub fn parts(&self) -> Vec<Part> {
         let mut parts = self.wait_parts();
@@ -46,10 +46,10 @@ impl LateCall {
             Some(sent_before) => wait.min(sent_before),
             None => wait,
         };
-        let mut parts = Rest::new(Stage::Publish, wait - since_sent).finish(Cause::Send);
-        let network = Rest::new(Stage::Network, since_sent - since_arrival);
+        let mut parts = Remainder::new(Stage::Publish, wait - since_sent).finish(Cause::Send);
+        let network = Remainder::new(Stage::Network, since_sent - since_arrival);
         parts.extend(network.finish(Cause::Transit));
-        let mut socket = Rest::new(Stage::Socket, since_arrival - in_process);
+        let mut socket = Remainder::new(Stage::Socket, since_arrival - in_process);
         if let Some(receiver) = &delivery.receiver {
             socket.take(Cause::Throttled, receiver.throttled);
             socket.take(Cause::Runnable, receiver.runnable);
@@ -64,7 +64,7 @@ impl LateCall {
     fn handoff_parts(&self, handoff: &Handoff, wait: Duration) -> Vec<Part> {
         let since_woken = handoff.woken_before;
         let Some(received_before) = handoff.received_before else {
-            let mut before = Rest::new(Stage::Wait, wait - since_woken);
+            let mut before = Remainder::new(Stage::Wait, wait - since_woken);
             before.take(Cause::Stopped, self.stopped(since_woken, wait));
             let mut parts = before.finish(Cause::Arrival);
             parts.extend(self.woken_parts(handoff));
@@ -75,8 +75,8 @@ impl LateCall {
             Some(_) => (Stage::Publish, Cause::Send),
             None => (Stage::Wait, Cause::Arrival),
         };
-        let mut parts = Rest::new(stage, wait - since_received).finish(cause);
-        let mut receive = Rest::new(Stage::Receive, since_received - since_woken);
+        let mut parts = Remainder::new(stage, wait - since_received).finish(cause);
+        let mut receive = Remainder::new(Stage::Receive, since_received - since_woken);
         // The thread may have been awake before the message was published.
         let awake = received_before.saturating_sub(since_woken);
         let share = |of| share(receive.rest, of, awake);
@@ -121,7 +121,7 @@ impl LateCall {
 
     /// The same, with what that thread did since the call before.
     fn parts_by(&self, states: Option<ThreadStates>, wait: Duration, waiting: Cause) -> Vec<Part> {
-        let mut rest = Rest::new(Stage::Wait, wait);
+        let mut rest = Remainder::new(Stage::Wait, wait);
         let stop = self.stop.as_ref().map_or(Span::default(), Stop::span);
         let stop = stop.within(wait);
         rest.take(Cause::Stopped, stop.duration());
@@ -164,7 +164,7 @@ impl LateCall {
     }
 
     fn callback_parts(&self) -> Vec<Part> {
-        let mut rest = Rest::new(Stage::Callback, self.duration);
+        let mut rest = Remainder::new(Stage::Callback, self.duration);
         let Some(states) = self.states else {
             return rest.finish(Cause::Unexplained);
         };
@@ -233,9 +233,11 @@ impl LateCall {
                 // The rest precedes an earlier call, and has no events.
                 let runnable = self.activity_before.as_ref()?.runnable;
                 let is_most = runnable * 2 >= part.duration;
-                is_most.then(|| self.culprit(part.stage)).flatten()
+                is_most
+                    .then(|| self.longest_other_thread(part.stage))
+                    .flatten()
             }
-            Cause::Runnable => self.culprit(part.stage),
+            Cause::Runnable => self.longest_other_thread(part.stage),
             Cause::Stopped if part.stage != Stage::Callback => {
                 self.stop.as_ref()?.wait.waker.as_ref()
             }
@@ -261,7 +263,7 @@ impl LateCall {
 
     /// Returns the thread that ran instead for longest in this stage. Idle CPUs are left out.
     #[must_use]
-    pub fn culprit(&self, stage: Stage) -> Option<&OtherThread> {
+    pub fn longest_other_thread(&self, stage: Stage) -> Option<&OtherThread> {
         let others = match (stage, &self.handoff, &self.delivery) {
             // Otherwise they may have run before the message was published. A wait is shorter than
             // the time since then, by that of the fastest message.
@@ -359,13 +361,13 @@ impl Activity {
 }
 
 /// The time of a stage that no part has yet.
-struct Rest {
+struct Remainder {
     stage: Stage,
     rest: Duration,
     parts: Vec<Part>,
 }
 
-impl Rest {
+impl Remainder {
     const fn new(stage: Stage, rest: Duration) -> Self {
         Self {
             stage,

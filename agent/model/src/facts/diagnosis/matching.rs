@@ -236,11 +236,13 @@ fn have_common_partition(one: &Qos, other: &Qos) -> bool {
         let default = qos.partitions.is_empty().then_some("");
         qos.partitions.iter().map(AsRef::as_ref).chain(default)
     }
-    names(one).any(|one| names(other).any(|other| meet(one, other) || meet(other, one)))
+    names(one).any(|one| {
+        names(other).any(|other| matches_pattern(one, other) || matches_pattern(other, one))
+    })
 }
 
 /// Returns whether `name`, which is not a pattern, matches a name or a pattern of `*` and `?`.
-fn meet(pattern: &str, name: &str) -> bool {
+fn matches_pattern(pattern: &str, name: &str) -> bool {
     let is_pattern = |text: &str| text.contains(['*', '?']);
     if is_pattern(name) || !is_pattern(pattern) {
         return pattern == name && !is_pattern(name);
@@ -402,7 +404,7 @@ mod tests {
     }
 
     #[test]
-    fn two_zenoh_endpoints_match_whatever_their_qos() {
+    fn two_zenoh_endpoints_match_with_any_qos() {
         let (mut writer, mut reader) = (qos(Role::Writer), qos(Role::Reader));
         writer.reliability = Reliability::BEST_EFFORT;
         reader.reliability = Reliability::RELIABLE;
@@ -551,7 +553,7 @@ mod tests {
                 }
             }
             let expected = naive(pattern.as_bytes(), name.as_bytes());
-            prop_assert_eq!(meet(&pattern, &name), expected);
+            prop_assert_eq!(matches_pattern(&pattern, &name), expected);
         }
     }
 }

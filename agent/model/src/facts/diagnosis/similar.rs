@@ -17,8 +17,8 @@ pub enum Difference {
 
 /// Minimum lengths of a part of a name between slashes, and of a word between underscores, in which
 /// one letter may be a mistake.
-const PART: usize = 4;
-const WORD: usize = 3;
+const MIN_PART_LEN: usize = 4;
+const MIN_WORD_LEN: usize = 3;
 
 impl Difference {
     /// Returns the label value.
@@ -113,8 +113,8 @@ fn is_one_letter((before, after): (&str, &str), (left, right): (&str, &str)) -> 
         begin + after.split(separators).next().map_or(0, str::len)
     };
     let is_separator = |part: &str| part.contains(['/', '_']);
-    length(&['/']) >= PART
-        && length(&['/', '_']) >= WORD
+    length(&['/']) >= MIN_PART_LEN
+        && length(&['/', '_']) >= MIN_WORD_LEN
         && !is_separator(left)
         && !is_separator(right)
 }

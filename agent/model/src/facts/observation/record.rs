@@ -15,14 +15,14 @@ impl Observation {
     /// time. Only a DATA_BATCH has several, or none.
     pub fn each(record: &Record, clock: WallClock, mut observe: impl FnMut(&Self)) {
         match record.body() {
-            Body::Batch(batch) => each_of_batch(batch, Head::of(record, clock), observe),
+            Body::Batch(batch) => for_each_of_batch(batch, Head::of(record, clock), observe),
             _ => observe(&Self::of(record, clock)),
         }
     }
 
-    /// Calls `observe` as [`Self::each`] does, with the record of a message that was polled in shared
-    /// memory.
-    pub fn each_polled(record: &Record, clock: WallClock, observe: impl FnMut(&Self)) {
+    /// Calls `observe` as [`Self::each`] does, with the record of a message that was polled in
+    /// shared memory.
+    pub fn for_each_polled(record: &Record, clock: WallClock, observe: impl FnMut(&Self)) {
         let flags = record.flags | flag::SHM;
         Self::each(&Record { flags, ..*record }, clock, observe);
     }
@@ -58,8 +58,9 @@ impl Observation {
 }
 
 /// Calls `observe` with the samples of a batch. Numbers that no sample of the batch has will not be
-/// sent, as a GAP says. The size of each sample is their mean. The last sample has the last number, and all others follow each other.
-fn each_of_batch(batch: record::Batch<'_>, head: Head, mut observe: impl FnMut(&Observation)) {
+/// sent, as a GAP says. The size of each sample is their mean. The last sample has the last number,
+/// and all others follow each other.
+fn for_each_of_batch(batch: record::Batch<'_>, head: Head, mut observe: impl FnMut(&Observation)) {
     let Some(others) = batch.count().checked_sub(1) else {
         return;
     };

@@ -121,7 +121,7 @@ fn a_batch_becomes_its_samples_and_a_gap_of_the_numbers_between_them() {
 }
 
 #[test]
-fn an_acknack_has_the_reader_as_sender_and_all_else_the_writer() {
+fn the_sender_of_an_acknack_is_the_reader_and_otherwise_the_writer() {
     for kind in [kind::DATA, kind::HEARTBEAT, kind::GAP, kind::ACKNACK] {
         let shown = observed(&of_kind(kind));
         let (sender, addressee) = match kind {
@@ -147,7 +147,7 @@ fn flags_of_a_record_determine_one_path_and_one_fate() {
     ] {
         assert_eq!(sample(&of_data(flags)).head.path, path, "{flags:#x}");
     }
-    Observation::each_polled(&of_data(0), WallClock::default(), |polled| {
+    Observation::for_each_polled(&of_data(0), WallClock::default(), |polled| {
         assert!(polled.head().is_polled());
     });
     for (flags, fate) in [
@@ -173,7 +173,7 @@ fn some_paths_prove_that_the_sender_is_on_this_host() {
             interface,
             ..of_data(flags)
         };
-        assert_eq!(sample(&record).head.leaves(), leaves, "{flags:#x}");
+        assert_eq!(sample(&record).head.is_outgoing(), leaves, "{flags:#x}");
     }
 }
 

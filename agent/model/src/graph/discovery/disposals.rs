@@ -13,7 +13,7 @@ use crate::facts::tables::LatestDisposals;
 /// Time after a disposal during which older announcements are ignored.
 const STALE_WITHIN: Duration = Duration::from_millis(500);
 /// Time after a disposal during which samples that were sent before may still arrive.
-const UNDER_WAY: Duration = Duration::from_secs(2);
+const MAX_TRANSMISSION_TIME: Duration = Duration::from_secs(2);
 
 /// The latest disposals, oldest first.
 #[derive(Debug, Default)]
@@ -30,7 +30,7 @@ impl Disposals {
 
     /// Returns whether the entity was disposed so recently that its samples may still arrive.
     pub(super) fn is_recent(&self, guid: Guid, now: ModelTime) -> bool {
-        let fresh = |at: ModelTime| at + UNDER_WAY > now;
+        let fresh = |at: ModelTime| at + MAX_TRANSMISSION_TIME > now;
         self.latest
             .iter()
             .any(|(disposed, at, ..)| *disposed == guid && fresh(*at))

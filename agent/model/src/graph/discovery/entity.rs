@@ -7,7 +7,7 @@ use ros2probe_wire::{DomainId, Guid};
 
 use super::facts::{Endpoint, ParticipantProxy};
 use crate::facts::churn::{Entity, Event};
-use crate::facts::event::{EventKind, TEXT, bounded};
+use crate::facts::event::{EventKind, MAX_TEXT, truncated};
 use crate::facts::names::{DdsName, NodeName, TypeName};
 
 /// A participant, endpoint or node.
@@ -82,7 +82,7 @@ impl<'a> DiscoveredEntity<'a> {
         let (domain_id, guid) = (*domain_id, *guid);
         match details {
             EntityDetails::Participant(proxy) => {
-                let text = |text: &Option<Arc<str>>| text.as_deref().map(bounded).map(Into::into);
+                let text = |text: &Option<Arc<str>>| text.as_deref().map(truncated).map(Into::into);
                 EventKind::Participant {
                     change,
                     domain_id,
@@ -97,14 +97,14 @@ impl<'a> DiscoveredEntity<'a> {
                 domain_id,
                 guid,
                 role: *role,
-                topic: topic.bounded(TEXT),
-                message_type: message_type.bounded(TEXT),
+                topic: topic.bounded(MAX_TEXT),
+                message_type: message_type.bounded(MAX_TEXT),
             },
             EntityDetails::Node(name) => EventKind::Node {
                 change,
                 domain_id,
                 participant: guid,
-                name: name.bounded(TEXT),
+                name: name.bounded(MAX_TEXT),
             },
         }
     }

@@ -22,17 +22,17 @@ use crate::facts::journal::Journal;
 use crate::facts::model_time::ModelTime;
 
 /// A participant seen over at least this span is established.
-const ESTABLISHED: Duration = Duration::from_secs(2);
+const MIN_ESTABLISHED_SPAN: Duration = Duration::from_secs(2);
 /// A participant that is not established is silent after this time without a packet.
 const UNESTABLISHED_SILENCE: Duration = Duration::from_secs(5);
 /// Any participant is silent after this time without a packet, whatever its lease: real ones
 /// announce themselves at least every 30 seconds (RTPS 2.5, 8.5.3.3.2).
 pub(super) const MAX_SILENCE: Duration = Duration::from_secs(90);
 /// Minimum time between two searches of a full table; it grows with the number of entries.
-const SEARCH: Duration = Duration::from_millis(100);
-const SEARCH_EACH: Duration = Duration::from_micros(10);
+const SEARCH_INTERVAL: Duration = Duration::from_millis(100);
+const SEARCH_TIME_PER_ENTRY: Duration = Duration::from_micros(10);
 /// Maximum number of candidates of each kind per search.
-const FOUND: usize = 64;
+const MAX_CANDIDATES: usize = 64;
 
 /// Candidates that a search of one table found.
 #[derive(Debug, Default)]
@@ -111,14 +111,15 @@ impl Victims {
             }
         }
         for list in [&mut self.silent, &mut self.others] {
-            if list.len() > FOUND {
-                list.select_nth_unstable(FOUND);
-                list.truncate(FOUND);
+            if list.len() > MAX_CANDIDATES {
+                list.select_nth_unstable(MAX_CANDIDATES);
+                list.truncate(MAX_CANDIDATES);
             }
             list.sort_unstable_by(|one, other| other.cmp(one));
-            list.shrink_to(FOUND);
+            list.shrink_to(MAX_CANDIDATES);
         }
-        self.search_after = now + SEARCH.max(SEARCH_EACH.saturating_mul(visited));
+        self.search_after =
+            now + SEARCH_INTERVAL.max(SEARCH_TIME_PER_ENTRY.saturating_mul(visited));
     }
 
     /// Returns the next entry to evict for the new one.
@@ -127,8 +128,8 @@ impl Victims {
         // A packet since the search makes an entry active again.
         let is_silent = |victim: &Victim| {
             let participant = discovery.participants.get(&victim.guid.prefix);
-            let heard = participant.map(|participant| participant.last_seen);
-            heard == Some(victim.last_seen) && victim.guid.prefix != guid.prefix
+            let last_seen_now = participant.map(|participant| participant.last_seen);
+            last_seen_now == Some(victim.last_seen) && victim.guid.prefix != guid.prefix
         };
         self.silent.truncate(last(&self.silent, is_silent));
         if let Some(victim) = self.silent.pop_if(|victim| victim.priority <= priority) {
@@ -142,14 +143,14 @@ impl Victims {
         };
         let is_trusted = priority.local || claims * 2 < discovery.cap(table);
         let is_nothing =
-            |victim: &Victim| victim.priority == Priority::NOTHING && !victim.is_established;
+            |victim: &Victim| victim.priority == Priority::NO_EVIDENCE && !victim.is_established;
         let goes =
             |victim: &mut Victim| victim.priority < priority && (is_trusted || is_nothing(victim));
         Some(self.others.pop_if(goes)?.guid)
     }
 
     fn claim(&mut self, priority: Priority) {
-        let is_claim = priority != Priority::NOTHING && !priority.local;
+        let is_claim = priority != Priority::NO_EVIDENCE && !priority.local;
         self.claims += usize::from(is_claim);
         self.watched_claims += usize::from(is_claim && priority.watched);
     }
@@ -160,7 +161,7 @@ impl Victim {
         let last_seen = participant.last_seen;
         Self {
             priority,
-            is_established: last_seen - participant.first_seen >= ESTABLISHED,
+            is_established: last_seen - participant.first_seen >= MIN_ESTABLISHED_SPAN,
             last_seen,
             guid,
         }
@@ -240,9 +241,9 @@ fn silence_priority(participant: &Participant, now: ModelTime) -> Option<Priorit
         return None;
     }
     if is_silent_for(MAX_SILENCE) {
-        return Some(Priority::NOTHING);
+        return Some(Priority::NO_EVIDENCE);
     }
-    let is_established = last - participant.first_seen >= ESTABLISHED;
+    let is_established = last - participant.first_seen >= MIN_ESTABLISHED_SPAN;
     (!is_established && is_silent_for(UNESTABLISHED_SILENCE)).then_some(priority)
 }
 

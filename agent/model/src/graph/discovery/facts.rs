@@ -22,7 +22,7 @@ use crate::facts::naming::Naming;
 use crate::facts::tables::ParticipantEndpoints;
 
 /// Maximum number of addresses kept per participant and kind.
-pub(super) const ADDRESSES: usize = 16;
+pub(super) const MAX_ADDRESSES: usize = 16;
 
 /// Source of a participant's domain, from the least to the most reliable.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -207,7 +207,7 @@ impl Addresses {
     pub(super) fn of(announcement: &ParticipantAnnouncement) -> Self {
         let udp = |locators: &[Locator]| {
             let addresses = locators.iter().filter_map(Locator::udp);
-            addresses.take(ADDRESSES).collect()
+            addresses.take(MAX_ADDRESSES).collect()
         };
         Self {
             metatraffic: udp(&announcement.metatraffic_unicast),
@@ -297,7 +297,7 @@ pub(super) fn named(nodes: &[Node]) -> usize {
 /// unicast ports are 7410 + 250 d + 2 p. Ports of 32768 and above are mostly ephemeral, so the
 /// domain is then assumed to be 0.
 pub(super) fn domain(announced: Option<DomainId>, origin: &Origin) -> (DomainId, DomainSource) {
-    const EPHEMERAL: u16 = 32_768;
+    const FIRST_EPHEMERAL_PORT: u16 = 32_768;
     if let Some(domain_id) = announced.filter(|domain_id| *domain_id <= DomainId::MAX) {
         return (domain_id, DomainSource::Announced);
     }
@@ -311,7 +311,7 @@ pub(super) fn domain(announced: Option<DomainId>, origin: &Origin) -> (DomainId,
     if is_multicast && rest == 0 && domain_id <= DomainId::MAX {
         return (domain_id, DomainSource::MulticastPort);
     }
-    if rest >= 10 && rest.is_multiple_of(2) && origin.port < EPHEMERAL {
+    if rest >= 10 && rest.is_multiple_of(2) && origin.port < FIRST_EPHEMERAL_PORT {
         return (domain_id, DomainSource::UnicastPort);
     }
     (DomainId(0), DomainSource::Assumed)

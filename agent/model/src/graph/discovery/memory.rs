@@ -159,7 +159,7 @@ impl Discovery {
                 self.participants.refuse();
                 continue;
             }
-            let room = self.node_count.room();
+            let room = self.node_count.remaining();
             let cut = participant.nodes.len().saturating_sub(room) as u64;
             self.node_count.refuse_all(cut);
             participant.nodes.truncate(room);

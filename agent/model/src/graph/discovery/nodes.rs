@@ -120,7 +120,7 @@ impl Discovery {
             Some(known) => &known.nodes,
             None => &[],
         };
-        let eviction = self.node_count.room();
+        let eviction = self.node_count.remaining();
         let names = self.caps.endpoints.saturating_sub(self.named);
         (eviction + known.len(), names + named(known))
     }

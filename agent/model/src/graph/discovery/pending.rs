@@ -112,32 +112,32 @@ mod tests {
 
     const WATCHED: Priority = Priority {
         watched: true,
-        ..Priority::NOTHING
+        ..Priority::NO_EVIDENCE
     };
 
     #[test]
     fn a_full_table_drops_the_oldest_entry_of_the_lowest_priority() {
         let mut waiting: PendingTable<Waiting, _, _> = PendingTable::new();
         assert!(!waiting.put(1, WATCHED, 'a'));
-        assert!(!waiting.put(2, Priority::NOTHING, 'b'));
-        assert!(!waiting.put(3, Priority::NOTHING, 'c'));
-        assert!(waiting.put(4, Priority::NOTHING, 'd'));
+        assert!(!waiting.put(2, Priority::NO_EVIDENCE, 'b'));
+        assert!(!waiting.put(3, Priority::NO_EVIDENCE, 'c'));
+        assert!(waiting.put(4, Priority::NO_EVIDENCE, 'd'));
         assert_eq!(waiting.remove(&2), None);
         assert!(waiting.put(5, WATCHED, 'e') && waiting.put(6, WATCHED, 'f'));
-        assert!(waiting.put(7, Priority::NOTHING, 'g'));
+        assert!(waiting.put(7, Priority::NO_EVIDENCE, 'g'));
         let left: Vec<_> = waiting.range(0..=9).map(|(key, _)| key).collect();
         assert_eq!((left, waiting.order.len()), (vec![1, 5, 6], 3));
         // Replacing an entry drops no other entry.
-        assert!(!waiting.put(5, Priority::NOTHING, 'h'));
-        assert_eq!(waiting.priority(&5), Some(Priority::NOTHING));
+        assert!(!waiting.put(5, Priority::NO_EVIDENCE, 'h'));
+        assert_eq!(waiting.priority(&5), Some(Priority::NO_EVIDENCE));
         waiting.rate(|_, value| {
             if *value == 'h' {
                 WATCHED
             } else {
-                Priority::NOTHING
+                Priority::NO_EVIDENCE
             }
         });
-        assert!(waiting.put(8, Priority::NOTHING, 'i'));
+        assert!(waiting.put(8, Priority::NO_EVIDENCE, 'i'));
         assert_eq!(
             (waiting.priority(&1), waiting.priority(&5)),
             (None, Some(WATCHED))

@@ -16,7 +16,7 @@ pub struct Priority {
 
 impl Priority {
     /// No evidence but an announcement.
-    pub const NOTHING: Self = Self {
+    pub const NO_EVIDENCE: Self = Self {
         watched: false,
         local: false,
         sends: false,
@@ -45,7 +45,7 @@ mod tests {
             sends,
         };
         let ascending = [
-            Priority::NOTHING,
+            Priority::NO_EVIDENCE,
             priority(false, false, true),
             priority(false, true, false),
             priority(false, true, true),

@@ -9,18 +9,18 @@ use ros2probe_wire::zenoh::{
 };
 
 use super::Place;
-use super::Shown;
+use super::ReportFact;
 use super::Zenoh;
 use super::messages::attachment;
 use super::stream::{StreamId, Unseen};
 use crate::facts::model_time::ModelTime;
 
 /// Free memory for messages in FRAGMENTs below which stale ones are given up: one large message.
-const ROOM: usize = 4 << 20;
+const MIN_FREE_BYTES: usize = 4 << 20;
 /// Time without a FRAGMENT after which a message is given up if memory is needed.
-const STALE: Duration = Duration::from_secs(10);
+const STALE_AFTER: Duration = Duration::from_secs(10);
 /// Minimum time between two searches for stale messages.
-const GIVE_UP_INTERVAL: Duration = Duration::from_secs(1);
+const STALE_SEARCH_INTERVAL: Duration = Duration::from_secs(1);
 
 impl Zenoh {
     pub(super) fn batch(
@@ -28,7 +28,7 @@ impl Zenoh {
         place: Place<'_>,
         batch: Batch<'_>,
         wants_bytes: bool,
-        show: &mut impl FnMut(Shown<'_>),
+        show: &mut impl FnMut(ReportFact<'_>),
     ) {
         let stream = place.stream;
         let is_known = self.directions.contains_key(stream);
@@ -38,17 +38,17 @@ impl Zenoh {
         direction.last_seen = place.time;
         if let Some(owner) = direction.owner(stream).filter(|_| !is_known) {
             // The connection is known from saved state.
-            show(Shown::Owner(stream.socket, owner.guid_prefix()));
+            show(ReportFact::Owner(stream.socket, owner.guid_prefix()));
         }
         if let Some(session) = direction.session() {
-            show(Shown::Alive(session));
+            show(ReportFact::Alive(session));
         }
         if direction
             .sender
             .is_some_and(|side| side.whatami == WhatAmI::Router)
         {
             for session in self.remembered.take_relayed() {
-                show(Shown::Relayed(session));
+                show(ReportFact::Relayed(session));
             }
         }
         for message in batch {
@@ -68,12 +68,12 @@ impl Zenoh {
                 }
                 // The capture omitted the end of the batch on purpose.
                 Err(error) if error.reason == Reason::Truncated => {}
-                Err(error) => show(Shown::Malformed(error.reason)),
+                Err(error) => show(ReportFact::Malformed(error.reason)),
             }
         }
     }
 
-    fn init(&mut self, stream: &StreamId, init: &Init<'_>, show: &mut impl FnMut(Shown<'_>)) {
+    fn init(&mut self, stream: &StreamId, init: &Init<'_>, show: &mut impl FnMut(ReportFact<'_>)) {
         let side = Side {
             zid: init.zid,
             whatami: init.whatami,
@@ -99,22 +99,22 @@ impl Zenoh {
         }
         self.join_transport(stream);
         if let Some(owner) = owner {
-            show(Shown::Owner(stream.socket, owner.guid_prefix()));
+            show(ReportFact::Owner(stream.socket, owner.guid_prefix()));
             self.has_begun = true;
         }
         self.revision += 1;
     }
 
     /// Gives up messages whose FRAGMENTs have stopped arriving, at most once a second.
-    fn give_up_chains(&mut self, now: ModelTime) {
-        if now < self.gave_up + GIVE_UP_INTERVAL {
+    fn drop_stale_chains(&mut self, now: ModelTime) {
+        if now < self.last_stale_search + STALE_SEARCH_INTERVAL {
             return;
         }
-        self.gave_up = now;
-        let before = now - STALE;
+        self.last_stale_search = now;
+        let before = now - STALE_AFTER;
         for direction in self.directions.values_mut() {
             let held = direction.held();
-            self.counters.incomplete += direction.give_up(before) as u64;
+            self.counters.incomplete += direction.drop_message(before) as u64;
             self.chain_bytes.sub(held - direction.held());
         }
     }
@@ -124,10 +124,10 @@ impl Zenoh {
         place: Place<'_>,
         fragment: &Fragment<'_>,
         wants_bytes: bool,
-        show: &mut impl FnMut(Shown<'_>),
+        show: &mut impl FnMut(ReportFact<'_>),
     ) {
-        if self.chain_bytes.room() < ROOM {
-            self.give_up_chains(place.time);
+        if self.chain_bytes.remaining() < MIN_FREE_BYTES {
+            self.drop_stale_chains(place.time);
         }
         let is_wanted = |beginning: &[u8]| match NetworkMessage::beginning(beginning) {
             Ok(NetworkMessage::Push(push)) => match push.sample {
@@ -142,7 +142,7 @@ impl Zenoh {
             return;
         };
         let before = direction.held();
-        let room = self.chain_bytes.room();
+        let room = self.chain_bytes.remaining();
         let waited = direction.chains.len();
         let chain = direction.fragment(fragment, place.time, is_wanted, room);
         let was_broken = chain.is_none() && direction.chains.len() < waited;
@@ -163,7 +163,7 @@ impl Zenoh {
         match message {
             Ok(message) => self.network(place, &message, show),
             Err(error) if error.reason == Reason::Truncated => self.counters.incomplete += 1,
-            Err(error) => show(Shown::Malformed(error.reason)),
+            Err(error) => show(ReportFact::Malformed(error.reason)),
         }
     }
 }

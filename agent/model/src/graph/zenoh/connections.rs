@@ -12,10 +12,10 @@ use super::stream_state::StreamState;
 use crate::facts::model_time::ModelTime;
 
 /// Lease that rmw_zenoh configures.
-const LEASE: Duration = Duration::from_secs(60);
+const DEFAULT_LEASE: Duration = Duration::from_secs(60);
 /// Part of its lease after which a sender is silent. A live sender sends several times in each
 /// lease, and the other end closes the connection after the whole lease.
-const SILENT: f64 = 0.9;
+const SILENT_LEASE_RATIO: f64 = 0.9;
 
 impl Zenoh {
     /// Returns the opposite direction, seen at the same socket or interface or, on the loopback
@@ -28,12 +28,12 @@ impl Zenoh {
     fn opposite_entry(&self, stream: &StreamId) -> Option<(&StreamId, &StreamState)> {
         match self.directions.get_key_value(&stream.reversed()) {
             Some((place, direction)) => Some((place, &**direction)),
-            None => self.elsewhere(stream),
+            None => self.opposite_of_flow(stream),
         }
     }
 
     /// Returns the opposite direction, and the stream in which it was last seen.
-    fn elsewhere(&self, stream: &StreamId) -> Option<(&StreamId, &StreamState)> {
+    fn opposite_of_flow(&self, stream: &StreamId) -> Option<(&StreamId, &StreamState)> {
         let place = self.flows.get(&stream.flow.reversed())?;
         Some((place, self.directions.get(place)?))
     }
@@ -41,7 +41,9 @@ impl Zenoh {
     /// Returns the receiving socket of a direction on the loopback interface, if its session is
     /// known; else 0.
     pub(super) fn receiving_socket(&self, stream: &StreamId) -> u64 {
-        let other = self.elsewhere(stream).filter(|_| stream.is_loopback());
+        let other = self
+            .opposite_of_flow(stream)
+            .filter(|_| stream.is_loopback());
         let owned = other.filter(|(place, direction)| direction.owner(place).is_some());
         owned.map_or(0, |(place, _)| place.socket)
     }
@@ -93,13 +95,13 @@ impl Zenoh {
         {
             // No end of the silent direction will be captured.
             direction.has_ended = true;
-            self.leave_now(&silent, now);
+            self.end_connection(&silent, now);
         }
-        self.leave_now(stream, now);
+        self.end_connection(stream, now);
     }
 
     /// Does the same as [`Self::leave`], without a check whether the other end has been silent.
-    fn leave_now(&mut self, stream: &StreamId, now: ModelTime) {
+    fn end_connection(&mut self, stream: &StreamId, now: ModelTime) {
         if self.remembered.sender(stream.flow).is_some() {
             self.direction(stream);
         }
@@ -202,8 +204,8 @@ impl Zenoh {
             return None;
         }
         let (place, other) = self.opposite_entry(stream)?;
-        let lease = other.lease.unwrap_or(LEASE);
-        let is_silent = other.last_seen + lease.mul_f64(SILENT) <= now;
+        let lease = other.lease.unwrap_or(DEFAULT_LEASE);
+        let is_silent = other.last_seen + lease.mul_f64(SILENT_LEASE_RATIO) <= now;
         (is_silent && !other.has_left).then_some(*place)
     }
 

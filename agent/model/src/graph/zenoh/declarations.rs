@@ -44,7 +44,7 @@ impl Zenoh {
         let lease = |session| lease(directions, session);
         let is_known = self.graph.declare(&key.key, (direction, id), lease);
         if let Some(router) = router.filter(|_| is_known) {
-            self.revision += u64::from(self.graph.pass_on(&key.key, router));
+            self.revision += u64::from(self.graph.add_passage(&key.key, router));
         }
     }
 

@@ -15,7 +15,7 @@ use crate::facts::tables::{ZenohDeclared, ZenohTokenIds};
 pub(super) type TokenNumber = u64;
 
 /// Bytes of a pair in the second index.
-const BESIDE: usize = 2 * size_of::<(TokenNumber, DirectionNumber)>();
+const INDEX_BYTES_PER_TOKEN: usize = 2 * size_of::<(TokenNumber, DirectionNumber)>();
 
 /// The pairs of directions and tokens.
 #[derive(Debug, Default)]
@@ -34,7 +34,9 @@ impl Declared {
             self.ids.insert(direction, id, token, 0);
         }
         if !self.directions.contains(&(token, direction))
-            && self.tokens.insert(direction, token, (), BESIDE)
+            && self
+                .tokens
+                .insert(direction, token, (), INDEX_BYTES_PER_TOKEN)
         {
             self.directions.insert((token, direction));
         }

@@ -7,9 +7,9 @@ use ros2probe_wire::zenoh::{EndpointKind, EndpointToken, Gid};
 use ros2probe_wire::{EntityId, Guid};
 
 /// Kind octet of a user-defined writer without key (RTPS 2.5, 9.3.1.2).
-const WRITER: u8 = 0x03;
+const WRITER_KIND: u8 = 0x03;
 /// Kind octet of a user-defined reader without key.
-const READER: u8 = 0x04;
+const READER_KIND: u8 = 0x04;
 
 /// Returns the announcements that DDS would make for an endpoint: two for a server or client.
 pub(super) fn announcements(token: &EndpointToken) -> Vec<EndpointAnnouncement> {
@@ -70,7 +70,7 @@ pub fn unknown_guid(gid: Gid) -> Guid {
 
 const fn kind(role: Role) -> u8 {
     match role {
-        Role::Writer => WRITER,
-        Role::Reader => READER,
+        Role::Writer => WRITER_KIND,
+        Role::Reader => READER_KIND,
     }
 }

@@ -25,10 +25,10 @@ use crate::facts::model_time::ModelTime;
 use crate::facts::tables::{ZenohPassages, ZenohRestored, ZenohServers, ZenohTokens, ZenohWriters};
 
 /// Bytes of a session besides its tokens: its state, and the first nodes of two trees.
-const SESSION: usize = 2048;
+const SESSION_OVERHEAD: usize = 2048;
 /// Bytes that a token's parts take in its node, among the writers and among the servers, without
 /// names.
-const PARTS: usize = 640;
+const TOKEN_OVERHEAD: usize = 640;
 /// Maximum number of routers that are remembered as forwarding tokens of sessions.
 pub(super) const MAX_PASSING_ROUTERS: usize = 256;
 /// An endpoint that discovery knows from saved state.
@@ -45,7 +45,7 @@ pub struct RestoredEndpoint<'a> {
 }
 
 /// Minimum time between two announcements of a session that discovery has forgotten.
-const REPEAT: Duration = Duration::from_secs(1);
+const REPEAT_INTERVAL: Duration = Duration::from_secs(1);
 
 /// A change of the graph, in the terms of DDS.
 #[derive(Debug)]
@@ -188,11 +188,11 @@ impl Graph {
     }
 
     /// Announces again a session that discovery has forgotten, at most once a second.
-    pub fn repeat(&mut self, session: ZenohId, now: ModelTime) {
+    pub fn announce_again(&mut self, session: ZenohId, now: ModelTime) {
         let Some(state) = self.sessions.get_mut(&session) else {
             return;
         };
-        if now < state.repeated + REPEAT {
+        if now < state.repeated + REPEAT_INTERVAL {
             return;
         }
         state.repeated = now;
@@ -233,9 +233,9 @@ impl Graph {
         let session = node.session;
         let text: Arc<str> = text.into();
         // The names in the text are stored again, in the node or in the key of a service.
-        let mut beside = PARTS + text.len();
+        let mut beside = TOKEN_OVERHEAD + text.len();
         if !self.sessions.contains_key(&session) {
-            beside += SESSION;
+            beside += SESSION_OVERHEAD;
         }
         self.numbered += 1;
         let state = TokenState {
@@ -327,30 +327,30 @@ impl Graph {
 
     /// Records that a router forwards this token of a session behind another router. Returns
     /// whether this was unknown.
-    pub fn pass_on(&mut self, token: &str, router: ZenohId) -> bool {
+    pub fn add_passage(&mut self, token: &str, router: ZenohId) -> bool {
         let Some(session) = self.tokens.get((), token).map(|token| token.session) else {
             return false;
         };
         if self.passages.get(router, &session).is_some() {
             return false;
         }
-        let has_room = self.passes_on(router) || self.routers() < MAX_PASSING_ROUTERS;
+        let has_room = self.has_passages(router) || self.routers() < MAX_PASSING_ROUTERS;
         has_room && self.passages.insert(router, session, (), 0)
     }
 
     /// Returns whether a router forwards tokens of sessions behind other routers.
-    pub fn passes_on(&self, router: ZenohId) -> bool {
+    pub fn has_passages(&self, router: ZenohId) -> bool {
         self.passages.of(router).next().is_some()
     }
 
     /// Returns the sessions whose tokens a router forwards.
-    pub fn passed_on_by(&self, router: ZenohId) -> BTreeSet<ZenohId> {
+    pub fn passages_of(&self, router: ZenohId) -> BTreeSet<ZenohId> {
         let sessions = self.passages.of(router);
         sessions.map(|(session, ())| *session).collect()
     }
 
     /// Removes a router that forwards tokens. Returns the sessions that no other router forwards.
-    pub fn pass_no_longer(&mut self, router: ZenohId) -> BTreeSet<ZenohId> {
+    pub fn remove_passages(&mut self, router: ZenohId) -> BTreeSet<ZenohId> {
         let mut sessions: BTreeSet<_> = self.passages.remove_owner(router).collect();
         for other in self.passages.owners() {
             sessions.retain(|session| self.passages.get(other, session).is_none());
@@ -362,7 +362,7 @@ impl Graph {
     pub fn passages(&self) -> BTreeMap<ZenohId, BTreeSet<ZenohId>> {
         let routers = self.passages.owners();
         routers
-            .map(|router| (router, self.passed_on_by(router)))
+            .map(|router| (router, self.passages_of(router)))
             .collect()
     }
 
@@ -388,7 +388,7 @@ impl Graph {
     }
 
     /// Removes the tokens of a session of this domain that no connection declares.
-    pub fn keep_declared(&mut self, session: ZenohId, domain: DomainId) {
+    pub fn drop_undeclared_tokens(&mut self, session: ZenohId, domain: DomainId) {
         let Some(state) = self.sessions.get(&session) else {
             if self.restored.get(&session) == Some(&domain) {
                 self.end(session);

@@ -8,7 +8,7 @@ use ros2probe_wire::zenoh::{
 };
 
 use super::Place;
-use super::Shown;
+use super::ReportFact;
 use super::Zenoh;
 use super::ZenohSample;
 use super::endpoints::unknown_guid;
@@ -22,7 +22,7 @@ impl Zenoh {
         &mut self,
         place: Place<'_>,
         message: &NetworkMessage<'_>,
-        show: &mut impl FnMut(Shown<'_>),
+        show: &mut impl FnMut(ReportFact<'_>),
     ) {
         match message {
             NetworkMessage::Push(push) => {
@@ -35,7 +35,7 @@ impl Zenoh {
                 if let (Declaration::Final, Some(interest)) =
                     (declare.declaration, declare.interest)
                 {
-                    self.compare_answer(place.stream, interest);
+                    self.remove_omitted_tokens(place.stream, interest);
                 }
             }
             NetworkMessage::Interest(interest) => self.interest(place.stream, interest),
@@ -61,7 +61,7 @@ impl Zenoh {
         let key = key.and_then(|key| self.resolve(stream, key));
         let domain = key.and_then(|alias| domain_of_graph(&alias.key));
         if let (Some(domain), Some(direction)) = (domain, self.directions.get_mut(stream)) {
-            direction.asked = Some((interest.id, domain));
+            direction.requested_interest = Some((interest.id, domain));
         }
     }
 
@@ -71,7 +71,7 @@ impl Zenoh {
         place: Place<'_>,
         key: WireExpr<'_>,
         put: &Put<'_>,
-        show: &mut impl FnMut(Shown<'_>),
+        show: &mut impl FnMut(ReportFact<'_>),
     ) {
         let alias = self.resolve(place.stream, key);
         let channel = alias.map_or(Channel::Messages, |alias| alias.channel);
@@ -86,7 +86,7 @@ impl Zenoh {
         let writer = writer.unwrap_or_else(|| unknown_guid(attachment.gid));
         self.note_source(place.stream, attachment.gid, show);
         let sample = self.arrived(place, writer, &attachment, put.payload);
-        show(Shown::Sample(&ZenohSample {
+        show(ReportFact::Sample(&ZenohSample {
             referring: match channel {
                 Channel::References(subscription) => Some(subscription),
                 Channel::Messages | Channel::Other => None,
@@ -96,7 +96,12 @@ impl Zenoh {
     }
 
     /// Passes the request of a service's client to `show`.
-    fn request(&self, place: Place<'_>, request: &Request<'_>, show: &mut impl FnMut(Shown<'_>)) {
+    fn request(
+        &self,
+        place: Place<'_>,
+        request: &Request<'_>,
+        show: &mut impl FnMut(ReportFact<'_>),
+    ) {
         let Some(attachment) = request.query.attachment.and_then(read_attachment) else {
             return;
         };
@@ -106,7 +111,7 @@ impl Zenoh {
         let Some(writer) = self.graph.writer(attachment.gid) else {
             return;
         };
-        show(Shown::Sample(&ZenohSample {
+        show(ReportFact::Sample(&ZenohSample {
             call: Some((attachment.gid, attachment.sequence_number)),
             ..self.arrived(place, writer, &attachment, payload)
         }));
@@ -117,7 +122,7 @@ impl Zenoh {
         &mut self,
         place: Place<'_>,
         response: &Response<'_>,
-        show: &mut impl FnMut(Shown<'_>),
+        show: &mut impl FnMut(ReportFact<'_>),
     ) {
         let ResponseBody::Reply {
             sample: Sample::Put(put),
@@ -149,7 +154,7 @@ impl Zenoh {
         };
         let call = (attachment.gid, attachment.sequence_number);
         let number = self.replies.number(writer, call);
-        show(Shown::Sample(&ZenohSample {
+        show(ReportFact::Sample(&ZenohSample {
             number,
             call: Some(call),
             ..self.arrived(place, writer, &attachment, put.payload)
@@ -182,7 +187,7 @@ impl Zenoh {
     }
 
     /// Derives from a publication the sender on a connection whose start was missed.
-    fn note_source(&mut self, stream: &StreamId, gid: Gid, show: &mut impl FnMut(Shown<'_>)) {
+    fn note_source(&mut self, stream: &StreamId, gid: Gid, show: &mut impl FnMut(ReportFact<'_>)) {
         let Some(session) = self.graph.session(gid) else {
             return;
         };
@@ -192,8 +197,10 @@ impl Zenoh {
             let before = direction.owner(stream);
             direction.note_source(session);
             match (before, direction.owner(stream)) {
-                (None, Some(owner)) => show(Shown::Owner(stream.socket, owner.guid_prefix())),
-                (Some(owner), None) => show(Shown::Disowned(stream.socket, owner.guid_prefix())),
+                (None, Some(owner)) => show(ReportFact::Owner(stream.socket, owner.guid_prefix())),
+                (Some(owner), None) => {
+                    show(ReportFact::Disowned(stream.socket, owner.guid_prefix()));
+                }
                 _ => {}
             }
         }

@@ -75,7 +75,7 @@ pub struct ZenohSample<'a> {
 
 /// A fact that a report shows.
 #[derive(Debug)]
-pub enum Shown<'a> {
+pub enum ReportFact<'a> {
     /// A message.
     Sample(&'a ZenohSample<'a>),
     /// A session owns a socket of this host.
@@ -106,13 +106,13 @@ pub struct Zenoh {
     replies: Replies,
     remembered: Remembered,
     /// Routers that lost a connection that may have led to another router, with the time.
-    cut: Bounded<ZenohCut, BTreeMap<ZenohId, ModelTime>>,
+    cut_routers: Bounded<ZenohCut, BTreeMap<ZenohId, ModelTime>>,
     /// Time of the first report.
     began: ModelTime,
     unseen: Bounded<ZenohUnseen, BTreeSet<(Unseen, Flow)>>,
     chain_bytes: Sum<ZenohChainBytes>,
     /// Time of the last search for stale messages in FRAGMENTs.
-    gave_up: ModelTime,
+    last_stale_search: ModelTime,
     counters: Counters,
     /// Whether a session of this host has sent an INIT since the last [`Self::link`].
     pub has_begun: bool,
@@ -137,7 +137,7 @@ impl Zenoh {
         report: &StreamReport<'_>,
         time: ModelTime,
         wants_bytes: bool,
-        show: &mut impl FnMut(Shown<'_>),
+        show: &mut impl FnMut(ReportFact<'_>),
     ) {
         let stream = report.stream;
         self.remembered.expire(time);
@@ -149,7 +149,7 @@ impl Zenoh {
             StreamEvent::End => self.end(stream, time),
             StreamEvent::Gap => {
                 self.counters.gaps += 1;
-                show(Shown::Missed(stream.flow.destination));
+                show(ReportFact::Missed(stream.flow.destination));
                 if let Some(direction) = self.directions.get_mut(stream) {
                     self.chain_bytes.sub(direction.held());
                     direction.interrupt();

@@ -20,7 +20,7 @@ use crate::facts::model_time::ModelTime;
 /// interval of KEEP_ALIVE that rmw_zenoh configures, 30 s.
 const ALL_SEEN: Duration = Duration::from_secs(35);
 /// Time in which another connection of a router may replace one that ended.
-const REPLACED: Duration = Duration::from_secs(1);
+const REPLACEMENT_TIMEOUT: Duration = Duration::from_secs(1);
 
 impl Zenoh {
     /// Determines which ends of connections are routers, from the processes that hold the sockets.
@@ -136,29 +136,29 @@ impl Zenoh {
     /// Records the end of a connection that may connect two routers.
     pub(super) fn note_cut(&mut self, stream: &StreamId, now: ModelTime) {
         for router in self.ends_of_link(stream) {
-            if self.graph.passes_on(router) {
-                self.cut.insert(router, now);
+            if self.graph.has_passages(router) {
+                self.cut_routers.insert(router, now);
             }
         }
     }
 
     /// Ends the sessions that a router no longer reaches.
     pub fn end_unreachable(&mut self, now: ModelTime) {
-        let is_due = |at: ModelTime| at + REPLACED <= now;
-        if now < self.began + ALL_SEEN || !self.cut.values().any(|at| is_due(*at)) {
+        let is_due = |at: ModelTime| at + REPLACEMENT_TIMEOUT <= now;
+        if now < self.began + ALL_SEEN || !self.cut_routers.values().any(|at| is_due(*at)) {
             return;
         }
-        let due = self.cut.iter().filter(|(_, at)| is_due(**at));
+        let due = self.cut_routers.iter().filter(|(_, at)| is_due(**at));
         let due: Vec<_> = due.map(|(router, _)| *router).collect();
-        self.cut.retain(|_, at| !is_due(*at));
+        self.cut_routers.retain(|_, at| !is_due(*at));
         for router in due {
             let mut streams = self.directions.keys();
             if streams.any(|stream| self.is_link_of(router, stream)) {
                 // It is unknown which sessions are behind the remaining connection.
                 continue;
             }
-            for session in self.graph.pass_no_longer(router) {
-                if !self.has_other_way(session, router) {
+            for session in self.graph.remove_passages(router) {
+                if !self.is_reachable_without(session, router) {
                     self.graph.end(session);
                     self.revision += 1;
                 }
@@ -168,8 +168,10 @@ impl Zenoh {
 
     /// Removes tokens that a router forwarded before but omits from its complete answer to a new
     /// session.
-    pub(super) fn compare_answer(&mut self, stream: &StreamId, interest: u32) {
-        let asked = self.opposite(stream).and_then(|opposite| opposite.asked);
+    pub(super) fn remove_omitted_tokens(&mut self, stream: &StreamId, interest: u32) {
+        let asked = self
+            .opposite(stream)
+            .and_then(|opposite| opposite.requested_interest);
         let Some((_, domain)) = asked.filter(|(id, _)| *id == interest) else {
             return;
         };
@@ -178,15 +180,15 @@ impl Zenoh {
         let Some(router) = self.passing_router(stream).filter(|_| to_peer) else {
             return;
         };
-        for session in self.graph.passed_on_by(router) {
-            if !self.has_other_way(session, router) {
-                self.graph.keep_declared(session, domain);
+        for session in self.graph.passages_of(router) {
+            if !self.is_reachable_without(session, router) {
+                self.graph.drop_undeclared_tokens(session, domain);
             }
         }
     }
 
     /// Returns whether a session is reachable without this router.
-    fn has_other_way(&self, session: ZenohId, router: ZenohId) -> bool {
+    fn is_reachable_without(&self, session: ZenohId, router: ZenohId) -> bool {
         let mut directions = self.directions.iter();
         let has_own = directions.any(|(stream, direction)| {
             direction.session() == Some(session) && self.is_open(stream, direction)

@@ -23,9 +23,9 @@ pub(super) const MAX_KEY: usize = 2048;
 /// Maximum size of one message in FRAGMENTs, in bytes.
 const MAX_MESSAGE: usize = 32 << 20;
 /// Bytes kept of a message whose payload is not requested: everything before the payload.
-const HEAD: usize = 8192;
+const MAX_HEAD: usize = 8192;
 /// Number of publications of one source after which it is considered the sender.
-const PRESUMED: u32 = 3;
+const MIN_PUBLICATIONS_OF_SENDER: u32 = 3;
 
 /// Number of a direction of a transport, never reused.
 pub(super) type DirectionNumber = u64;
@@ -91,7 +91,7 @@ pub(super) struct StreamState {
     /// The receiving router, if its id is known.
     pub(super) receiver: Option<Side>,
     /// Number and domain of the sender's last INTEREST in the graph of a domain.
-    pub(super) asked: Option<(u32, DomainId)>,
+    pub(super) requested_interest: Option<(u32, DomainId)>,
     pub(super) lease: Option<Duration>,
     pub(super) chains: Bounded<ZenohChains, Vec<Chain>>,
     /// Whether the sender has sent CLOSE, or closed the connection.
@@ -121,7 +121,7 @@ impl Chain {
 
 impl Chain {
     /// Adds bytes to the message, as far as `room` bytes of further memory suffice.
-    fn keep(&mut self, bytes: &[u8], room: usize) {
+    fn append(&mut self, bytes: &[u8], room: usize) {
         let (length, capacity) = (self.bytes.len(), self.bytes.capacity());
         let bytes = bytes.get(..capacity - length + room).unwrap_or(bytes);
         let needed = length + bytes.len();
@@ -169,7 +169,9 @@ impl StreamState {
 
     /// Returns the session that sends, as far as is known.
     pub(super) fn session(&self) -> Option<ZenohId> {
-        let presumed = self.presumed.filter(|(_, count)| *count >= PRESUMED);
+        let presumed = self
+            .presumed
+            .filter(|(_, count)| *count >= MIN_PUBLICATIONS_OF_SENDER);
         let is_certain = !self.is_ambiguous && !self.may_be_router && !self.is_router;
         let presumed = presumed.filter(|_| is_certain);
         self.sender
@@ -257,10 +259,14 @@ impl StreamState {
         let captured = fragment.bytes.captured;
         let is_whole_so_far = chain.bytes.len() == chain.length;
         chain.length += fragment.bytes.length;
-        let most = if chain.is_wanted { MAX_MESSAGE } else { HEAD };
+        let most = if chain.is_wanted {
+            MAX_MESSAGE
+        } else {
+            MAX_HEAD
+        };
         if is_whole_so_far {
             let kept = most.saturating_sub(chain.bytes.len());
-            chain.keep(captured.get(..kept).unwrap_or(captured), room);
+            chain.append(captured.get(..kept).unwrap_or(captured), room);
         }
         chain.last = time;
         chain.next = Resolution::DEFAULT.next(number);
@@ -272,7 +278,7 @@ impl StreamState {
     }
 
     /// Gives up messages without a FRAGMENT since `before`, and returns their number.
-    pub(super) fn give_up(&mut self, before: ModelTime) -> usize {
+    pub(super) fn drop_message(&mut self, before: ModelTime) -> usize {
         let all = self.chains.len();
         self.chains.retain(|chain| chain.last >= before);
         all - self.chains.len()

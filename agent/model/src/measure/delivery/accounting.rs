@@ -90,30 +90,31 @@ impl Accounting<'_> {
         for (first, last, cause) in runs {
             if self.withheld.is_none() {
                 let events = &mut self.journal.events;
-                events.lose_delivery(self.writer, self.receiver, self.at, (first, last));
+                events.add_delivery_loss(self.writer, self.receiver, self.at, (first, last));
             }
             match cause {
-                Some(cause) => self.lose(cause, first, last),
+                Some(cause) => self.add_loss(cause, first, last),
                 None => self.locate(first, last),
             }
         }
     }
 
-    /// Counts samples without a known cause. A gap within one TCP connection was left by the sender.
+    /// Counts samples without a known cause. A gap within one TCP connection was left by the
+    /// sender.
     fn locate(&mut self, first: SequenceNumber, last: SequenceNumber) {
         let from = self.in_order_from.max(first);
         if from > first {
             self.wait(first, last.min(from.previous()));
         }
         if from <= last {
-            self.lose(LossCause::Sender, from, last);
+            self.add_loss(LossCause::Sender, from, last);
         }
     }
 
     /// Marks samples as pending: their cause is not known yet.
     pub(super) fn wait(&mut self, first: SequenceNumber, last: SequenceNumber) {
         let Some(until) = self.until else {
-            self.lose(LossCause::BeforeHost, first, last);
+            self.add_loss(LossCause::BeforeHost, first, last);
             return;
         };
         self.count(|tally| tally.pending += last - first + 1);
@@ -126,18 +127,23 @@ impl Accounting<'_> {
     pub(super) fn conclude(&mut self, first: SequenceNumber, last: SequenceNumber) {
         let count = last - first + 1;
         self.count(|tally| tally.pending = tally.pending.saturating_sub(count));
-        self.lose(LossCause::BeforeHost, first, last);
+        self.add_loss(LossCause::BeforeHost, first, last);
     }
 
     /// Settles a pending sample as lost by this cause.
-    pub(super) fn explain(&mut self, cause: LossCause, number: SequenceNumber) {
+    pub(super) fn set_cause(&mut self, cause: LossCause, number: SequenceNumber) {
         self.count(|tally| tally.pending = tally.pending.saturating_sub(1));
-        self.lose(cause, number, number);
+        self.add_loss(cause, number, number);
     }
 
-    pub(super) fn lose(&mut self, cause: LossCause, first: SequenceNumber, last: SequenceNumber) {
+    pub(super) fn add_loss(
+        &mut self,
+        cause: LossCause,
+        first: SequenceNumber,
+        last: SequenceNumber,
+    ) {
         let count = last - first + 1;
-        self.count(|tally| tally.lose(cause, count));
+        self.count(|tally| tally.add_lost(cause, count));
         let loss = DeliveryLoss {
             at: self.at,
             writer: self.writer,
@@ -152,7 +158,7 @@ impl Accounting<'_> {
             last,
         };
         let Some(withheld) = &mut self.withheld else {
-            self.journal.lose_delivery(loss);
+            self.journal.add_delivery_loss(loss);
             return;
         };
         withheld.push_back(loss);

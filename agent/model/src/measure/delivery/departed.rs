@@ -4,9 +4,9 @@ use ros2probe_wire::SequenceNumber;
 
 use super::Delivery;
 use super::DeliveryContext;
-use super::FIRST_MOMENTS;
+use super::MAX_TRANSIT_TIME;
 use super::SILENCE;
-use super::UNDER_WAY;
+use super::START_GRACE;
 use crate::facts::model_time::ModelTime;
 
 impl Delivery {
@@ -21,38 +21,40 @@ impl Delivery {
         context: &mut DeliveryContext<'_>,
     ) {
         if !self.reception.sequence().started() || newest < self.next() {
-            (self.waiting, self.presumed_lost, self.under_way) = (None, false, 0);
+            (self.waiting, self.presumed_lost, self.overdue) = (None, false, 0);
             return;
         }
         let since = *self.waiting.get_or_insert(context.now);
-        let mut until = alive.map_or(ModelTime::ZERO, |alive| alive.min(context.now - UNDER_WAY));
+        let mut until = alive.map_or(ModelTime::ZERO, |alive| {
+            alive.min(context.now - MAX_TRANSIT_TIME)
+        });
         if !self.presumed_lost && since + SILENCE <= context.now {
             self.presumed_lost = true;
-            until = until.max(since + FIRST_MOMENTS);
+            until = until.max(since + START_GRACE);
         }
-        let due = left_by(context.now - UNDER_WAY).filter(|_| !self.presumed_lost);
+        let due = left_by(context.now - MAX_TRANSIT_TIME).filter(|_| !self.presumed_lost);
         let lost = left_by(until).filter(|number| *number >= self.next());
         if let Some(number) = lost.filter(|_| until >= since) {
             self.connection = None;
             self.exists(number, context);
         }
-        self.under_way = due.map_or(0, |due| due.next().steps_since(self.next()));
+        self.overdue = due.map_or(0, |due| due.next().steps_since(self.next()));
     }
 
     /// Settles samples up to `newest`, which have left for this receiver and will not arrive.
-    pub fn expect_no_more(&mut self, newest: SequenceNumber, context: &mut DeliveryContext<'_>) {
+    pub fn settle_departed(&mut self, newest: SequenceNumber, context: &mut DeliveryContext<'_>) {
         if self.reception.sequence().started() && !self.presumed_lost {
             self.connection = None;
             self.exists(newest, context);
         }
     }
 
-    /// Excuses samples that were written before the receiver's reader appeared. `next` and
+    /// Marks samples irrelevant that were written before the receiver's reader appeared. `next` and
     /// `advanced` describe the sequence before the current observation.
-    pub(super) fn excuse_unheard(&mut self, (next, advanced): (SequenceNumber, ModelTime)) {
+    pub(super) fn mark_unread_irrelevant(&mut self, (next, advanced): (SequenceNumber, ModelTime)) {
         let sequence = self.reception.sequence_mut();
         if next > SequenceNumber::ZERO && advanced < self.opened && sequence.next() > next {
-            sequence.excuse(next, sequence.next());
+            sequence.mark_irrelevant(next, sequence.next());
         }
     }
 }

@@ -11,7 +11,7 @@ impl Delivery {
     pub fn facts(&self) -> Delivered {
         let awaited = match self.direction() {
             Direction::Sent => 0,
-            Direction::Received => self.reception.sequence().undecided() + self.under_way,
+            Direction::Received => self.reception.sequence().undecided() + self.overdue,
         };
         Delivered {
             awaited,

@@ -24,7 +24,7 @@ impl Delivery {
         };
         totals.received.add(&self.tally);
         for loss in losses {
-            journal.lose_delivery(loss);
+            journal.add_delivery_loss(loss);
         }
     }
 

@@ -55,7 +55,7 @@ impl RequestBegin {
     }
 
     /// Returns whether its first sample so far has a higher number.
-    pub(super) fn begins_after(&self, number: SequenceNumber) -> bool {
+    pub(super) fn starts_after(&self, number: SequenceNumber) -> bool {
         self.first.is_some_and(|first| first > number)
     }
 
@@ -73,7 +73,7 @@ impl RequestBegin {
     /// Polling shared memory notices numbers late, perhaps those of samples that were sent before
     /// the request. Numbers that polling missed therefore count from the first sample that arrives or
     /// is reported. If there is none in time, they count from the start of the request.
-    pub(super) fn misses_from(
+    pub(super) fn first_missed(
         &self,
         reason: MissedReason,
         now: ModelTime,

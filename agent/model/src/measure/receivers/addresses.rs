@@ -20,7 +20,7 @@ pub(super) struct AnnouncedAddresses {
     /// Addresses in the order of their announcements.
     ages: Bounded<Counted<Addresses>, BTreeMap<u64, Destination>>,
     /// The same order, per participant.
-    own: Bounded<Counted<Addresses>, BTreeSet<(GuidPrefix, u64)>>,
+    by_participant: Bounded<Counted<Addresses>, BTreeSet<(GuidPrefix, u64)>>,
     age: u64,
     each: usize,
 }
@@ -40,7 +40,7 @@ impl AnnouncedAddresses {
         Self {
             announcers: Bounded::capped(limit),
             ages: Bounded::capped(limit),
-            own: Bounded::capped(limit),
+            by_participant: Bounded::capped(limit),
             age: 0,
             each,
         }
@@ -60,18 +60,18 @@ impl AnnouncedAddresses {
         };
         if let Some(before) = before {
             self.ages.remove(&before.age);
-            self.own.remove(&(before.prefix, before.age));
+            self.by_participant.remove(&(before.prefix, before.age));
         }
-        let own = || self.own.range((prefix, 0)..=(prefix, u64::MAX));
+        let own = || self.by_participant.range((prefix, 0)..=(prefix, u64::MAX));
         let oldest = own().next().filter(|_| own().count() >= self.each);
         if let Some((_, age)) = oldest.copied() {
-            self.give_up(age);
+            self.drop_oldest(age);
         }
         if before.is_none()
             && self.announcers.is_full()
             && let Some((age, _)) = self.ages.first_key_value()
         {
-            self.give_up(*age);
+            self.drop_oldest(*age);
         }
         let age = self.age;
         let announcer = Announcer {
@@ -82,7 +82,7 @@ impl AnnouncedAddresses {
         };
         self.announcers.insert(destination, announcer);
         self.ages.insert(age, destination);
-        self.own.insert((prefix, age));
+        self.by_participant.insert((prefix, age));
         before.is_none_or(|before| before.prefix != prefix)
     }
 
@@ -90,7 +90,7 @@ impl AnnouncedAddresses {
     pub(super) fn retain(&mut self, is_there: impl Fn(&GuidPrefix) -> bool) {
         self.announcers
             .retain(|_, announcer| is_there(&announcer.prefix));
-        self.own.retain(|(prefix, _)| is_there(prefix));
+        self.by_participant.retain(|(prefix, _)| is_there(prefix));
         let announcers = &self.announcers;
         self.ages
             .retain(|_, destination| announcers.contains_key(destination));
@@ -108,13 +108,13 @@ impl AnnouncedAddresses {
         self.announcers.facts()
     }
 
-    fn give_up(&mut self, age: u64) {
+    fn drop_oldest(&mut self, age: u64) {
         let announcer = self
             .ages
             .remove(&age)
             .and_then(|destination| self.announcers.remove(&destination));
         if let Some(announcer) = announcer {
-            self.own.remove(&(announcer.prefix, age));
+            self.by_participant.remove(&(announcer.prefix, age));
             self.announcers.refuse();
         }
     }
@@ -148,7 +148,10 @@ mod tests {
         assert_eq!(addresses.owner(&at(7411)), Some(BOB));
         assert_eq!(addresses.owner(&at(8999)), Some(ALICE));
         assert_eq!(addresses.owner(&at(8000)), None);
-        assert_eq!((addresses.ages.len(), addresses.own.len()), (17, 17));
+        assert_eq!(
+            (addresses.ages.len(), addresses.by_participant.len()),
+            (17, 17)
+        );
     }
 
     #[test]
@@ -163,7 +166,10 @@ mod tests {
         assert_eq!(addresses.owner(&at(7411)), Some(BOB));
         addresses.retain(|prefix| *prefix == BOB);
         assert_eq!(size(&addresses).0, 1);
-        assert_eq!((addresses.ages.len(), addresses.own.len()), (1, 1));
+        assert_eq!(
+            (addresses.ages.len(), addresses.by_participant.len()),
+            (1, 1)
+        );
     }
 
     #[test]

@@ -15,9 +15,9 @@ use crate::measure::topic::{Accelerated, Topic};
 
 /// Maximum effort of one comparison. Endpoints whose lists of partitions exceed it count as a
 /// match.
-const EFFORT: usize = 4096;
+const MATCHING_EFFORT: usize = 4096;
 /// Maximum number of readers that the search for any match compares.
-const COMPARED: usize = 64;
+const MAX_COMPARED: usize = 64;
 
 /// The readers of one writer's topic.
 #[derive(Clone, Copy, Debug)]
@@ -89,7 +89,7 @@ impl<'a> MatchedReaders<'a> {
         readers
             .by_ref()
             .filter(|guid| !guid.entity.is_writer())
-            .take(COMPARED)
+            .take(MAX_COMPARED)
             .any(|guid| self.matches(*guid))
             || readers.next().is_some()
     }
@@ -121,7 +121,7 @@ impl<'a> MatchedReaders<'a> {
         let readers = self.topic.map(|topic| &topic.readers);
         let (mut some, mut whole) = (false, false);
         for (place, reader) in readers.into_iter().flatten().enumerate() {
-            if place == COMPARED {
+            if place == MAX_COMPARED {
                 whole = true;
                 break;
             }
@@ -152,7 +152,7 @@ impl<'a> MatchedReaders<'a> {
         one.topic == other.topic
             && one.message_type == other.message_type
             && writer.shares_protocol(reader)
-            && (effort(writer.qos, reader.qos) > EFFORT
+            && (effort(writer.qos, reader.qos) > MATCHING_EFFORT
                 || verdict(writer, reader) == Verdict::Match)
     }
 

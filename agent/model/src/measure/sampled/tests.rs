@@ -1,5 +1,5 @@
 use super::*;
-use crate::measure::sequence::{FAR, REACH, Settled};
+use crate::measure::sequence::{MAX_ANNOUNCED_JUMP, MAX_TRUSTED_JUMP, Settled};
 use ros2probe_wire::time::{SECOND, nanoseconds};
 
 struct View {
@@ -17,7 +17,7 @@ impl View {
         }
     }
 
-    fn see(&mut self, number: u64) -> SampledUpdate {
+    fn receive(&mut self, number: u64) -> SampledUpdate {
         self.part(number, Completeness::Complete)
     }
 
@@ -26,7 +26,7 @@ impl View {
         let now = ModelTime::from_nanoseconds(self.now);
         self.sampled.sample(
             (SequenceNumber(number), seen, Some(Timestamp(self.now))),
-            FAR,
+            MAX_ANNOUNCED_JUMP,
             now,
             &mut self.sequence,
         )
@@ -49,7 +49,7 @@ impl View {
 fn unseen_messages_count_as_sent_and_not_as_lost() {
     let mut view = View::new();
     for number in [1, 2, 5, 6, 100] {
-        view.see(number);
+        view.receive(number);
     }
     assert_eq!(view.counts(), (5, 100));
     assert_eq!(view.losses(), []);
@@ -74,21 +74,21 @@ fn a_sample_counts_once_despite_fragments_and_copies() {
         update.map(|update| update.finished),
         [false, false, true, false]
     );
-    view.see(3);
+    view.receive(3);
     // The sample is late but was seen after all.
     let late = SampledUpdate {
         finished: true,
         ..SampledUpdate::default()
     };
-    assert_eq!(view.see(2), late);
-    assert_eq!(view.see(2), SampledUpdate::default());
+    assert_eq!(view.receive(2), late);
+    assert_eq!(view.receive(2), SampledUpdate::default());
     assert_eq!(view.counts(), (3, 3));
 }
 
 #[test]
 fn a_sample_with_a_known_number_still_waits_for_its_later_fragments() {
     let mut view = View::new();
-    view.see(1);
+    view.receive(1);
     let has = |view: &View, number| view.sampled.has(number, view.sequence.next());
     view.part(2, Completeness::Partial);
     assert_eq!(
@@ -103,13 +103,13 @@ fn a_sample_with_a_known_number_still_waits_for_its_later_fragments() {
         [true, false]
     );
     view.part(3, Completeness::LastFragment);
-    view.see(500);
+    view.receive(500);
     // 300 is too old to be waited for, and numbers skipped by a GAP are not waited for either.
     assert!(has(&view, SequenceNumber(300)) && !has(&view, SequenceNumber(499)));
     let now = ModelTime::from_nanoseconds(view.now);
     view.sampled.skip(
         (SequenceNumber(501), SequenceNumber(503)),
-        FAR,
+        MAX_ANNOUNCED_JUMP,
         now,
         &mut view.sequence,
     );
@@ -119,10 +119,10 @@ fn a_sample_with_a_known_number_still_waits_for_its_later_fragments() {
 #[test]
 fn an_interval_is_measured_only_between_two_seen_neighbours() {
     let mut view = View::new();
-    assert_eq!(view.see(1).interval, None);
-    assert_eq!(view.see(2).interval, Some(10_000_000));
-    assert_eq!(view.see(4).interval, None);
-    assert_eq!(view.see(5).interval, Some(10_000_000));
+    assert_eq!(view.receive(1).interval, None);
+    assert_eq!(view.receive(2).interval, Some(10_000_000));
+    assert_eq!(view.receive(4).interval, None);
+    assert_eq!(view.receive(5).interval, Some(10_000_000));
 }
 
 #[test]
@@ -130,19 +130,31 @@ fn a_heartbeat_reveals_unseen_samples_and_a_gap_those_never_sent() {
     let mut view = View::new();
     let now = ModelTime::from_nanoseconds(view.now);
     assert_eq!(
-        view.sampled
-            .exist(SequenceNumber(7), FAR, now, &mut view.sequence),
+        view.sampled.note_existing(
+            SequenceNumber(7),
+            MAX_ANNOUNCED_JUMP,
+            now,
+            &mut view.sequence
+        ),
         0
     );
-    view.see(5);
+    view.receive(5);
     assert_eq!(
-        view.sampled
-            .exist(SequenceNumber(7), FAR, now, &mut view.sequence),
+        view.sampled.note_existing(
+            SequenceNumber(7),
+            MAX_ANNOUNCED_JUMP,
+            now,
+            &mut view.sequence
+        ),
         2
     );
     assert_eq!(
-        view.sampled
-            .exist(SequenceNumber(6), FAR, now, &mut view.sequence),
+        view.sampled.note_existing(
+            SequenceNumber(6),
+            MAX_ANNOUNCED_JUMP,
+            now,
+            &mut view.sequence
+        ),
         0
     );
     assert_eq!(view.counts(), (1, 3));
@@ -150,21 +162,24 @@ fn a_heartbeat_reveals_unseen_samples_and_a_gap_those_never_sent() {
     assert_eq!(
         view.sampled.skip(
             (SequenceNumber(9), SequenceNumber(12)),
-            FAR,
+            MAX_ANNOUNCED_JUMP,
             now,
             &mut view.sequence
         ),
         1
     );
     assert_eq!(view.counts(), (1, 4));
-    let update = view.see(12);
+    let update = view.receive(12);
     // The update includes 6, 7 and 8, whose sizes are not known either.
     assert_eq!((update.samples, update.alike), (1, 4));
-    view.see(7);
+    view.receive(7);
     assert_eq!(view.counts(), (3, 5));
-    let forged = view
-        .sampled
-        .exist(SequenceNumber(1 << 40), FAR, now, &mut view.sequence);
+    let forged = view.sampled.note_existing(
+        SequenceNumber(1 << 40),
+        MAX_ANNOUNCED_JUMP,
+        now,
+        &mut view.sequence,
+    );
     assert_eq!((forged, view.counts()), (0, (3, 5)));
     assert_eq!(view.losses(), []);
 }
@@ -172,22 +187,26 @@ fn a_heartbeat_reveals_unseen_samples_and_a_gap_those_never_sent() {
 #[test]
 fn a_writer_that_restarts_under_its_guid_counts_from_its_new_numbers() {
     let mut view = View::new();
-    view.see(1);
-    view.see(1000);
+    view.receive(1);
+    view.receive(1000);
     view.now += 60 * SECOND;
-    assert_eq!(view.see(1).samples, 1);
-    assert_eq!(view.see(2).samples, 1);
+    assert_eq!(view.receive(1).samples, 1);
+    assert_eq!(view.receive(2).samples, 1);
     assert_eq!(view.counts(), (4, 1002));
 }
 
 #[test]
 fn a_late_sample_that_a_heartbeat_announced_is_not_a_restart() {
     let mut view = View::new();
-    view.see(1);
+    view.receive(1);
     let now = ModelTime::from_nanoseconds(view.now);
     assert_eq!(
-        view.sampled
-            .exist(SequenceNumber(5), FAR, now, &mut view.sequence),
+        view.sampled.note_existing(
+            SequenceNumber(5),
+            MAX_ANNOUNCED_JUMP,
+            now,
+            &mut view.sequence
+        ),
         4
     );
     view.now += SECOND;
@@ -209,32 +228,36 @@ fn an_unseen_message_is_reported_once_after_the_arrival_timeout() {
         view.sampled.tick(ModelTime::from_nanoseconds(view.now));
         view.sampled.take_unseen()
     };
-    view.see(1);
+    view.receive(1);
     assert_eq!(settle(&mut view), []);
-    view.see(5);
+    view.receive(5);
     assert!(view.sampled.unseen_since().is_some());
     // The sample may still arrive until the next tick.
     assert_eq!(settle(&mut view), []);
-    assert!(view.see(3).finished);
+    assert!(view.receive(3).finished);
     assert_eq!(settle(&mut view), runs(&[(2, 2), (4, 4)]));
     assert_eq!(view.sampled.unseen_since(), None);
-    assert!(!view.see(4).finished, "given after it was left out");
+    assert!(!view.receive(4).finished, "given after it was left out");
     // Neither a part of a sample nor a HEARTBEAT makes it seen.
     view.part(6, Completeness::Partial);
     let now = ModelTime::from_nanoseconds(view.now);
-    view.sampled
-        .exist(SequenceNumber(8), FAR, now, &mut view.sequence);
+    view.sampled.note_existing(
+        SequenceNumber(8),
+        MAX_ANNOUNCED_JUMP,
+        now,
+        &mut view.sequence,
+    );
     // Numbers skipped by a GAP are not missing.
     view.sampled.skip(
         (SequenceNumber(9), SequenceNumber(200)),
-        FAR,
+        MAX_ANNOUNCED_JUMP,
         now,
         &mut view.sequence,
     );
     assert_eq!(settle(&mut view), runs(&[(6, 8)]));
     assert_eq!(settle(&mut view), []);
     assert_eq!(
-        (view.see(200).finished, view.see(1000).finished),
+        (view.receive(200).finished, view.receive(1000).finished),
         (true, true)
     );
     view.sampled.settle_all();
@@ -244,8 +267,8 @@ fn an_unseen_message_is_reported_once_after_the_arrival_timeout() {
 #[test]
 fn a_message_counted_from_another_source_is_not_reported_as_unseen() {
     let mut view = View::new();
-    view.see(1);
-    view.see(3);
+    view.receive(1);
+    view.receive(3);
     view.sampled.end();
     // The sample may still arrive; it is skipped when the view begins again.
     assert_eq!(view.sampled.take_unseen(), []);
@@ -255,8 +278,8 @@ fn a_message_counted_from_another_source_is_not_reported_as_unseen() {
         view.sequence
             .exists(SequenceNumber(number), now, &mut |_| {});
     }
-    view.see(500);
-    view.see(502);
+    view.receive(500);
+    view.receive(502);
     view.sampled.settle_all();
     assert_eq!(view.sampled.take_unseen(), runs(&[(2, 2), (501, 501)]));
 }
@@ -265,14 +288,16 @@ fn a_message_counted_from_another_source_is_not_reported_as_unseen() {
 fn a_jump_beyond_all_windows_causes_bounded_work_and_no_loss() {
     let mut view = View::new();
     for number in 1..=6 {
-        view.see(number);
+        view.receive(number);
     }
     // Each counts alone until the jump is confirmed; then the skipped numbers count, too.
-    let samples: Vec<_> = (1..=6).map(|n| view.see(1_000_000 + n).samples).collect();
+    let samples: Vec<_> = (1..=6)
+        .map(|n| view.receive(1_000_000 + n).samples)
+        .collect();
     assert_eq!(samples, [1, 1, 1, 1, 999_995, 1]);
     assert_eq!(view.losses(), []);
-    view.see(u64::MAX);
-    view.see(0);
+    view.receive(u64::MAX);
+    view.receive(0);
     assert_eq!(view.counts(), (12, 1_000_006));
     assert!((1..=6).all(|n| {
         view.sampled
@@ -284,7 +309,7 @@ fn a_jump_beyond_all_windows_causes_bounded_work_and_no_loss() {
 fn a_forged_number_far_ahead_counts_as_one_message_and_affects_no_other() {
     let mut view = View::new();
     for number in 1..=5 {
-        view.see(number);
+        view.receive(number);
     }
     view.part(6, Completeness::Partial);
     let forged = view.part(1 << 40, Completeness::Partial);
@@ -292,14 +317,17 @@ fn a_forged_number_far_ahead_counts_as_one_message_and_affects_no_other() {
     assert!(view.part(1 << 40, Completeness::Complete).finished);
     assert!(!view.part(1 << 40, Completeness::Complete).finished);
     assert!(view.part(6, Completeness::Complete).finished);
-    assert_eq!(view.see(7).samples, 1);
+    assert_eq!(view.receive(7).samples, 1);
     let now = ModelTime::from_nanoseconds(view.now);
-    let messages = view
-        .sampled
-        .exist(SequenceNumber(3000), REACH, now, &mut view.sequence);
+    let messages = view.sampled.note_existing(
+        SequenceNumber(3000),
+        MAX_TRUSTED_JUMP,
+        now,
+        &mut view.sequence,
+    );
     let passed = view.sampled.skip(
         (SequenceNumber(2000), SequenceNumber(3000)),
-        REACH,
+        MAX_TRUSTED_JUMP,
         now,
         &mut view.sequence,
     );
@@ -334,10 +362,10 @@ fn runs(runs: &[(u64, u64)]) -> Vec<(SequenceNumber, SequenceNumber)> {
 fn possibly_missed(seen: impl Iterator<Item = u64>) -> u64 {
     let mut view = View::new();
     seen.for_each(|number| {
-        view.see(number);
+        view.receive(number);
     });
     let interval = Duration::from_secs(100);
-    view.sampled.seeming_silence(interval).as_secs() / interval.as_secs()
+    view.sampled.max_unseen_time(interval).as_secs() / interval.as_secs()
 }
 
 #[test]
@@ -352,13 +380,13 @@ fn consecutive_missed_messages_explain_a_longer_silence() {
     assert!(possibly_missed((1..=50).chain(100..=101)) > 400);
     // On a busy machine, polling can pause for seconds.
     let mut view = View::new();
-    view.see(1);
-    let short = view.sampled.seeming_silence(Duration::from_millis(1));
-    assert_eq!(short, POLLING_HOLE);
+    view.receive(1);
+    let short = view.sampled.max_unseen_time(Duration::from_millis(1));
+    assert_eq!(short, MAX_POLLING_GAP);
     view.sampled.end();
     assert!(
         view.sampled
-            .seeming_silence(Duration::from_secs(1))
+            .max_unseen_time(Duration::from_secs(1))
             .is_zero()
     );
 }

@@ -46,15 +46,15 @@ impl Bitmap {
     }
 
     pub(super) fn set_all(&mut self, start: SequenceNumber, end: SequenceNumber) {
-        self.each_word(start, end, |word, mask| *word |= mask);
+        self.for_each_word(start, end, |word, mask| *word |= mask);
     }
 
     pub(super) fn clear(&mut self, start: SequenceNumber, end: SequenceNumber) {
-        self.each_word(start, end, |word, mask| *word &= !mask);
+        self.for_each_word(start, end, |word, mask| *word &= !mask);
     }
 
-    /// Changes whole words, because one ACKNACK or GAP may excuse thousands of numbers.
-    fn each_word(
+    /// Changes whole words, because one ACKNACK or GAP may make thousands of numbers irrelevant.
+    fn for_each_word(
         &mut self,
         start: SequenceNumber,
         end: SequenceNumber,

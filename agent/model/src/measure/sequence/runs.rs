@@ -2,14 +2,14 @@
 
 use ros2probe_wire::{SequenceNumber, Timestamp};
 
-use super::FAR;
-use super::INCARNATION;
+use super::MAX_ANNOUNCED_JUMP;
 use super::MAX_JUMP;
+use super::MAX_STALE;
+use super::MIN_INCARNATION_GAP;
 use super::RunMembership;
-use super::STALE;
 use super::Sequence;
 use super::Settled;
-use super::unconfirmed::{CONFIRMATIONS, Run};
+use super::unconfirmed::{REQUIRED_CONFIRMATIONS, Run};
 use crate::facts::model_time::ModelTime;
 
 impl Sequence {
@@ -39,7 +39,7 @@ impl Sequence {
             }
             return RunMembership::Confirmed(run);
         }
-        if self.stale >= STALE && number < self.floor() {
+        if self.stale >= MAX_STALE && number < self.floor() {
             self.restart(number);
         }
         if number >= self.next && self.started() {
@@ -67,7 +67,7 @@ impl Sequence {
             return number - self.next > reach;
         }
         let newer = source.is_some_and(|source| {
-            self.newest_source.0 > 0 && source > self.newest_source + INCARNATION
+            self.newest_source.0 > 0 && source > self.newest_source + MIN_INCARNATION_GAP
         });
         // A restarted writer fills no gaps of its previous run.
         let unconfirmed = self.unconfirmed.as_ref();
@@ -75,10 +75,11 @@ impl Sequence {
             || unconfirmed.is_some_and(|unconfirmed| unconfirmed.is_continued(number, self.next));
         // The first samples may have been forged as well, so a lower number far away is
         // unconfirmed. A lower number within `FAR` is history.
-        let is_young = self.followed < CONFIRMATIONS;
+        let is_young = self.followed < REQUIRED_CONFIRMATIONS;
         // The source time of a number above `newest` is unknown: it arrived by another route.
         let is_repeated = || number <= self.newest && self.has(number);
-        newer && (is_repeated() || continues()) || is_young && self.next - number > FAR
+        newer && (is_repeated() || continues())
+            || is_young && self.next - number > MAX_ANNOUNCED_JUMP
     }
 
     /// Marks an unconfirmed sample as whole. Returns whether that is new.
@@ -103,7 +104,7 @@ impl Sequence {
             }
         }
         let (start, end) = run.gap;
-        self.excuse(start, end);
+        self.mark_irrelevant(start, end);
     }
 
     /// Makes the unconfirmed run live: the numbers jump to it or restart.
@@ -115,8 +116,8 @@ impl Sequence {
         };
         let jump = (*first >= self.next).then(|| *first - self.next);
         // While the live run has only a few samples, a long jump is a restart rather than a loss.
-        let most = match self.followed < CONFIRMATIONS {
-            true => FAR,
+        let most = match self.followed < REQUIRED_CONFIRMATIONS {
+            true => MAX_ANNOUNCED_JUMP,
             false => MAX_JUMP,
         };
         if jump.is_none_or(|jump| jump > most) {

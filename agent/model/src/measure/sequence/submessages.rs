@@ -3,9 +3,9 @@
 
 use ros2probe_wire::SequenceNumber;
 
-use super::FAR;
+use super::MAX_ANNOUNCED_JUMP;
 use super::MAX_JUMP;
-use super::REACH;
+use super::MAX_TRUSTED_JUMP;
 use super::Sequence;
 use super::Settled;
 use super::unconfirmed::Run;
@@ -25,7 +25,7 @@ impl Sequence {
             return;
         }
         let next = last.next();
-        let (is_confirmed, run) = self.claim(next, REACH, now);
+        let (is_confirmed, run) = self.claim(next, MAX_TRUSTED_JUMP, now);
         if let Some(run) = run {
             self.accept(&run, now, settled);
         }
@@ -53,7 +53,7 @@ impl Sequence {
     ) -> (bool, Option<Run>) {
         let live = self.next;
         let unconfirmed = self.unconfirmed.as_mut();
-        if unconfirmed.is_some_and(|unconfirmed| unconfirmed.agrees(next, live, now)) {
+        if unconfirmed.is_some_and(|unconfirmed| unconfirmed.confirms(next, live, now)) {
             return (true, Some(self.confirm()));
         }
         let ahead = next.steps_since(live);
@@ -64,7 +64,7 @@ impl Sequence {
             return (true, None);
         }
         let unconfirmed = self.unconfirmed.get_or_insert_default();
-        if ahead <= FAR && unconfirmed.is_claimed(next, reach, now) {
+        if ahead <= MAX_ANNOUNCED_JUMP && unconfirmed.is_claimed(next, reach, now) {
             return (true, None);
         }
         self.jumps += 1;
@@ -73,8 +73,8 @@ impl Sequence {
 
     /// Returns whether an ACKNACK is refused because it acknowledges numbers far above the known
     /// ones.
-    pub const fn refuses(&mut self, base: SequenceNumber) -> bool {
-        let refuses = self.started() && base.steps_since(self.next) > FAR;
+    pub const fn is_too_far_ahead(&mut self, base: SequenceNumber) -> bool {
+        let refuses = self.started() && base.steps_since(self.next) > MAX_ANNOUNCED_JUMP;
         self.jumps += refuses as u64;
         refuses
     }
@@ -83,7 +83,7 @@ impl Sequence {
     /// samples that the writer had withdrawn before.
     pub fn acknowledged(&mut self, base: SequenceNumber) {
         if self.started() {
-            self.excuse(self.available, base);
+            self.mark_irrelevant(self.available, base);
             self.acknowledged = self.acknowledged.max(base);
         }
     }
@@ -101,23 +101,23 @@ impl Sequence {
             return;
         }
         let ahead = base.steps_since(self.next);
-        if ahead > REACH {
+        if ahead > MAX_TRUSTED_JUMP {
             self.jumps += 1;
             if ahead <= MAX_JUMP {
                 self.unconfirmed
                     .get_or_insert_default()
-                    .pass_over(start, base);
+                    .note_gap(start, base);
             }
             return;
         }
         let mut one = |sequence: &mut Self, start: SequenceNumber, end: SequenceNumber| {
             if end > sequence.next {
-                if end - sequence.next > REACH {
+                if end - sequence.next > MAX_TRUSTED_JUMP {
                     return;
                 }
                 sequence.extend(end.previous(), end, now, settled);
             }
-            sequence.excuse(start.max(sequence.settled), end);
+            sequence.mark_irrelevant(start.max(sequence.settled), end);
         };
         one(self, start, base);
         for number in set {
@@ -139,9 +139,9 @@ impl Sequence {
         }
     }
 
-    /// Excuses `start..end`, so that no number in it is lost.
-    pub fn excuse(&mut self, start: SequenceNumber, end: SequenceNumber) {
+    /// Marks `start..end` irrelevant, so that no number in it is lost.
+    pub fn mark_irrelevant(&mut self, start: SequenceNumber, end: SequenceNumber) {
         let start = start.max(self.floor()).max(self.settled);
-        self.excused.set_all(start, end.min(self.next));
+        self.irrelevant.set_all(start, end.min(self.next));
     }
 }

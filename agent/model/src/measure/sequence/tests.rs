@@ -29,7 +29,10 @@ impl Bench {
         let number = SequenceNumber(number);
         let (lost, irrelevant) = (&mut self.lost, &mut self.irrelevant);
         let (source, now) = (source.map(Timestamp), ModelTime::from_nanoseconds(self.now));
-        match self.sequence.recognise(number, source, REACH, now) {
+        match self
+            .sequence
+            .recognise(number, source, MAX_TRUSTED_JUMP, now)
+        {
             RunMembership::Live => {}
             RunMembership::Unconfirmed { .. } => {
                 if !self.sequence.complete_unconfirmed(number) {
@@ -150,7 +153,7 @@ fn numbers_before_the_first_observed_sample_are_not_lost() {
 }
 
 #[test]
-fn a_gap_submessage_excuses_numbers_and_a_heartbeat_does_not() {
+fn a_gap_marks_numbers_irrelevant_and_a_heartbeat_does_not() {
     let mut bench = Bench::default();
     bench.receive([1, 4, 7, 9]);
     bench.sequence.gap(
@@ -204,7 +207,7 @@ fn withdrawn_samples_are_decided_after_the_grace_period() {
 }
 
 #[test]
-fn a_gap_submessage_ahead_of_the_data_does_not_excuse_later_samples() {
+fn a_gap_ahead_of_the_data_marks_no_later_sample_irrelevant() {
     let mut bench = Bench::default();
     bench.receive([1]);
     bench.sequence.gap(

@@ -8,15 +8,15 @@ use std::time::Duration;
 
 use ros2probe_wire::SequenceNumber;
 
-use super::FAR;
+use super::MAX_ANNOUNCED_JUMP;
 use crate::facts::bounded::Bounded;
 use crate::facts::model_time::ModelTime;
 use crate::facts::tables::UnconfirmedNumbers;
 
 /// Number of datagrams that confirm a run.
-pub(super) const CONFIRMATIONS: u8 = 5;
+pub(super) const REQUIRED_CONFIRMATIONS: u8 = 5;
 /// Copies of one datagram arrive at several sockets within this time.
-const COPIES: Duration = Duration::from_millis(5);
+const COPY_WINDOW: Duration = Duration::from_millis(5);
 
 /// A run that is not confirmed yet, and the claims of HEARTBEATs and GAPs.
 #[derive(Debug, Default)]
@@ -48,7 +48,7 @@ impl UnconfirmedRun {
             return (false, false);
         }
         let last = numbers.back().map(|(last, _)| *last);
-        let opens = last.is_none_or(|last| last.distance(number) > FAR);
+        let opens = last.is_none_or(|last| last.distance(number) > MAX_ANNOUNCED_JUMP);
         if opens {
             self.run.numbers.clear();
             self.evidence = 0;
@@ -76,7 +76,7 @@ impl UnconfirmedRun {
     /// Returns whether this number continues a run below `live`.
     pub(super) fn is_continued(&self, number: SequenceNumber, live: SequenceNumber) -> bool {
         let last = self.run.numbers.back().filter(|_| self.evidence > 0);
-        last.is_some_and(|(last, _)| *last < live && last.distance(number) <= FAR)
+        last.is_some_and(|(last, _)| *last < live && last.distance(number) <= MAX_ANNOUNCED_JUMP)
     }
 
     pub(super) fn is_whole(&self, number: SequenceNumber) -> bool {
@@ -84,7 +84,7 @@ impl UnconfirmedRun {
     }
 
     pub(super) const fn is_confirmed(&self) -> bool {
-        self.evidence >= CONFIRMATIONS
+        self.evidence >= REQUIRED_CONFIRMATIONS
     }
 
     /// Resets the evidence, because the live run continued.
@@ -95,7 +95,7 @@ impl UnconfirmedRun {
 
     /// Returns whether a HEARTBEAT with lastSN `next - 1` confirms the run, where `live` is the
     /// live run's next number. A HEARTBEAT that reaches `live` never confirms a run below it.
-    pub(super) fn agrees(
+    pub(super) fn confirms(
         &self,
         next: SequenceNumber,
         live: SequenceNumber,
@@ -105,12 +105,12 @@ impl UnconfirmedRun {
         let is_ahead = end > live;
         self.evidence > 0
             && now > self.since
-            && (end..=end.saturating_add(FAR)).contains(&next)
+            && (end..=end.saturating_add(MAX_ANNOUNCED_JUMP)).contains(&next)
             && (is_ahead || next < live)
     }
 
-    /// Returns whether a HEARTBEAT at least [`COPIES`] ago had the same lastSN, or one lower by at
-    /// most `reach`.
+    /// Returns whether a HEARTBEAT at least [`COPY_WINDOW`] ago had the same lastSN, or one lower
+    /// by at most `reach`.
     pub(super) fn is_claimed(&mut self, next: SequenceNumber, reach: u64, now: ModelTime) -> bool {
         let (claimed, at) = self.claim;
         let is_same = claimed > SequenceNumber::ZERO
@@ -118,11 +118,11 @@ impl UnconfirmedRun {
         if !is_same {
             self.claim = (next, now);
         }
-        is_same && now - at >= COPIES
+        is_same && now - at >= COPY_WINDOW
     }
 
     /// Records the numbers that a GAP skips.
-    pub(super) const fn pass_over(&mut self, start: SequenceNumber, end: SequenceNumber) {
+    pub(super) const fn note_gap(&mut self, start: SequenceNumber, end: SequenceNumber) {
         self.run.gap = (start, end);
     }
 

@@ -41,7 +41,7 @@ impl Subscribers {
             self.routes.retain(|known| {
                 known.matched == Matched::Yes || known.last_seen + ROUTE_TIMEOUT > now
             });
-            self.drop_orphans(context);
+            self.drop_routeless(context);
         }
     }
 
@@ -78,13 +78,13 @@ impl Subscribers {
     }
 
     /// Returns the time of the last observation of each delivery.
-    pub fn silent_since(&self) -> impl Iterator<Item = ModelTime> + '_ {
+    pub fn last_seen_times(&self) -> impl Iterator<Item = ModelTime> + '_ {
         self.deliveries.iter().map(|delivery| delivery.seen().1)
     }
 
     /// Drops at most `count` deliveries whose last observation is not after `until`. Returns the
     /// number of dropped deliveries.
-    pub fn give_up(
+    pub fn drop_oldest(
         &mut self,
         until: ModelTime,
         count: usize,
@@ -109,7 +109,7 @@ impl Subscribers {
             let Some(delivery) = self.deliveries.get(index) else {
                 return;
             };
-            let (main, next) = (delivery.main(), delivery.next());
+            let (main, next) = (delivery.main_route(), delivery.next());
             let Some(at) = self.routes.find(&main) else {
                 continue;
             };
@@ -119,7 +119,7 @@ impl Subscribers {
                     .get_mut(at)
                     .filter(|_| next > SequenceNumber::ZERO)
                 {
-                    known.mark(next.previous(), context.now);
+                    known.note_departure(next.previous(), context.now);
                 }
                 continue;
             }
@@ -128,7 +128,7 @@ impl Subscribers {
             if is_wire || known.is_none_or(|known| known.matched == Matched::No) {
                 continue;
             }
-            let Some(leaving) = self.routes.leaving(main.destination) else {
+            let Some(leaving) = self.routes.outgoing(main.destination) else {
                 continue;
             };
             let left = self.find(Receiver::Route(leaving.route));
@@ -151,23 +151,23 @@ impl Subscribers {
                 return;
             };
             if no_more {
-                delivery.expect_no_more(newest, &mut context);
+                delivery.settle_departed(newest, &mut context);
             } else {
-                delivery.expect(newest, alive, |at| leaving.left_by(at), &mut context);
+                delivery.expect(newest, alive, |at| leaving.departed_by(at), &mut context);
             }
         }
     }
 
     /// Drops the routes of this destination that were observed on a wire, because it is now
     /// observed at a socket.
-    pub(super) fn uncover(&mut self, route: Route, context: &mut WriterContext<'_>) {
+    pub(super) fn drop_wire_routes(&mut self, route: Route, context: &mut WriterContext<'_>) {
         self.at_socket = true;
         let destination = route.destination;
         let before = self.routes.iter().count();
         self.routes
             .retain(|known| known.at_socket || known.route.destination != destination);
         if self.routes.iter().count() < before {
-            self.drop_orphans(context);
+            self.drop_routeless(context);
         }
     }
 
@@ -188,7 +188,7 @@ impl Subscribers {
         }
         self.identify(context);
         if closed {
-            self.drop_orphans(context);
+            self.drop_routeless(context);
         }
         for delivery in &mut self.deliveries {
             let is_left = match delivery.receiver() {
@@ -240,7 +240,7 @@ impl Subscribers {
                     continue;
                 }
             }
-            if self.name_delivery(place, owner, context) {
+            if self.identify_delivery(place, owner, context) {
                 index = 0;
             }
         }
@@ -249,7 +249,7 @@ impl Subscribers {
 
     /// Records the participant of a delivery, merges it with another one of that participant, and
     /// publishes its counts. Returns whether they were merged.
-    fn name_delivery(
+    fn identify_delivery(
         &mut self,
         place: usize,
         owner: GuidPrefix,
@@ -264,9 +264,9 @@ impl Subscribers {
         };
         // Before both were known as one receiver, a sample may have arrived by either route.
         let of_both = self.deliveries.get(place).zip(self.deliveries.get(other));
-        let common = of_both.map_or(0, |(one, other)| one.common_with(other));
+        let common = of_both.map_or(0, |(one, other)| one.count_common(other));
         if let Some(delivery) = self.deliveries.get_mut(place) {
-            delivery.drop_common(
+            delivery.count_common_as_duplicates(
                 common,
                 &mut delivery_context(&mut self.totals, self.reassembled, context),
             );
@@ -307,7 +307,7 @@ impl Subscribers {
         let owner = self.routes.find(&route).and_then(|at| self.routes.get(at));
         let owner = owner.and_then(|known| known.owner);
         for delivery in &mut self.deliveries {
-            if delivery.main() == unknown {
+            if delivery.main_route() == unknown {
                 delivery.move_to(route);
             }
         }
@@ -316,11 +316,11 @@ impl Subscribers {
         };
         match owner {
             Some(owner) => {
-                self.name_delivery(place, owner, context);
+                self.identify_delivery(place, owner, context);
             }
             None => {
                 if let Some(delivery) = self.deliveries.get_mut(place) {
-                    delivery.lead_to(route);
+                    delivery.set_route(route);
                 }
             }
         }
@@ -338,7 +338,7 @@ impl Subscribers {
     }
 
     /// Drops deliveries without a route.
-    fn drop_orphans(&mut self, context: &mut WriterContext<'_>) {
+    fn drop_routeless(&mut self, context: &mut WriterContext<'_>) {
         let led_to: Vec<_> = self
             .with_routes()
             .map(|(_, routes)| !routes.is_empty())
@@ -363,7 +363,7 @@ impl Subscribers {
             } else if goes {
                 delivery.settle(&mut delivery_context(totals, reassembled, context));
                 let share = delivery.last_share();
-                if !delivery.main().is_sent() && share.lost > departed.lost {
+                if !delivery.main_route().is_sent() && share.lost > departed.lost {
                     *departed = share;
                 }
             }

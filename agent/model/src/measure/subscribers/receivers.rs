@@ -53,6 +53,6 @@ impl Subscribers {
     pub(super) fn received(&self) -> impl Iterator<Item = &Delivery> {
         self.deliveries
             .iter()
-            .filter(|delivery| !delivery.main().is_sent() && !delivery.is_withheld())
+            .filter(|delivery| !delivery.main_route().is_sent() && !delivery.is_withheld())
     }
 }

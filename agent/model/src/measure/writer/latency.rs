@@ -3,10 +3,10 @@
 
 use ros2probe_wire::{RtpsTime, SequenceNumber, Timestamp};
 
-use super::HISTORY;
+use super::MIN_HISTORY_AGE;
 use super::Writer;
 use super::seconds;
-use crate::facts::header::{PLAUSIBLE, stamp_time};
+use crate::facts::header::{MAX_PLAUSIBLE_OFFSET, stamp_time};
 use crate::facts::model_time::ModelTime;
 
 impl Writer {
@@ -22,7 +22,7 @@ impl Writer {
             |stamp: Timestamp| Timestamp(stamp.0.saturating_add_signed(ahead.saturating_neg()));
         let source = source.timestamp().map(here);
         if self.traits.keeps_history {
-            let old = source.is_none_or(|source| source + HISTORY < wall_clock);
+            let old = source.is_none_or(|source| source + MIN_HISTORY_AGE < wall_clock);
             let first = self.reception.sequence().first();
             if !newest || number < first || number == first && old {
                 return;
@@ -35,7 +35,7 @@ impl Writer {
         let mut negative = false;
         if let Some(source) = source {
             let delay = wall_clock.nanoseconds_since(source);
-            let is_plausible = source.distance(wall_clock) <= PLAUSIBLE;
+            let is_plausible = source.distance(wall_clock) <= MAX_PLAUSIBLE_OFFSET;
             self.implausible_latency += u64::from(!is_plausible);
             negative |= delay < 0;
             if delay >= 0 && is_plausible {

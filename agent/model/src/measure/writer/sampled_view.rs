@@ -17,10 +17,10 @@ use crate::measure::samples::Budget;
 
 impl Writer {
     /// Reports samples to the journal that were sent but not seen.
-    pub(super) fn leave_unseen(&mut self, journal: &mut Journal) {
+    pub(super) fn report_unseen(&mut self, journal: &mut Journal) {
         let unseen = self.sampled.as_mut().map(|sampled| sampled.take_unseen());
         for (first, last) in unseen.into_iter().flatten() {
-            journal.leave_missing(Missing {
+            journal.add_missing(Missing {
                 writer: self.guid,
                 first,
                 last,
@@ -30,7 +30,7 @@ impl Writer {
     }
 
     /// Returns whether the sample was pending when the sampled view ended.
-    pub(super) fn is_under_way(&self, sample: &Sample) -> bool {
+    pub(super) fn is_pending(&self, sample: &Sample) -> bool {
         let (at, number) = (sample.head.at, sample.sequence_number);
         self.sampled
             .as_ref()
@@ -58,7 +58,7 @@ impl Writer {
         let sampled = self
             .sampled
             .get_or_insert_with(|| Box::new(Sampled::new(now)));
-        sampled.take_over(&abandoned, self.reception.sequence().next(), now);
+        sampled.add_partial(&abandoned, self.reception.sequence().next(), now);
         if is_sampled {
             sampled.touch(now);
         }
@@ -77,16 +77,16 @@ impl Writer {
             }
             Observation::Heartbeat(heartbeat) => {
                 self.traits.reliable = true;
-                sampled.exist(heartbeat.last, reach, now, sequence)
+                sampled.note_existing(heartbeat.last, reach, now, sequence)
             }
             Observation::Gap(gap) => sampled.skip((gap.start, gap.list.base), reach, now, sequence),
             // The reader has all samples below this number.
             Observation::AckNack(acknack) => {
-                sampled.exist(acknack.base().previous(), reach, now, sequence)
+                sampled.note_existing(acknack.base().previous(), reach, now, sequence)
             }
             Observation::Presence(_) => 0,
         };
-        sampled.pace(announced, since, now);
+        sampled.note_interval(announced, since, now);
         if announced > 0 {
             self.last_message = self.last_message.max(Some(now));
         }
@@ -106,7 +106,7 @@ impl Writer {
         (since, now): (ModelTime, ModelTime),
     ) {
         if let Some(sampled) = &mut self.sampled {
-            sampled.pace(update.samples, since, now);
+            sampled.note_interval(update.samples, since, now);
         }
         let disposals = u64::from(!sample.is_message() && update.samples > 0);
         let messages = update.samples - disposals;
@@ -176,7 +176,7 @@ impl Writer {
             Completeness::Partial
         };
         let number = sample.sequence_number;
-        let update = self.sampled.as_mut()?.catch_up(number, seen);
+        let update = self.sampled.as_mut()?.add_late(number, seen);
         self.sampled_sample(sample, &update, (now, context.wall_clock.wall_time(now)))
     }
 

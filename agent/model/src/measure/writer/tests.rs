@@ -325,7 +325,7 @@ fn intervals_between_messages_are_measured_exactly() {
 }
 
 #[test]
-fn samples_sent_elsewhere_before_a_reader_existed_here_are_not_lost() {
+fn samples_sent_to_other_hosts_before_a_local_reader_existed_are_not_lost() {
     let mut bench = Bench::new(Traits::default());
     bench.data(1).data(2).wait(60_000);
     bench.opened = ModelTime::from_nanoseconds(bench.now);
@@ -398,7 +398,7 @@ fn a_message_that_only_a_heartbeat_announces_counts_as_the_last_message() {
 }
 
 #[test]
-fn a_writer_whose_messages_polling_misses_may_seem_silent_for_long() {
+fn missed_polls_extend_the_possible_silence_of_a_writer() {
     let slowest = Duration::from_secs(2);
     let silence_of = |seen: &dyn Fn(u64) -> bool| {
         let mut bench = Bench::new(RELIABLE);
@@ -406,7 +406,7 @@ fn a_writer_whose_messages_polling_misses_may_seem_silent_for_long() {
             bench.now = START + number * SECOND;
             bench.put(in_shared_memory(data(number)));
         }
-        bench.writer.seeming_silence(slowest).as_secs_f64()
+        bench.writer.max_unseen_time(slowest).as_secs_f64()
     };
     // The interval is one second. A missed message may be followed by others, unless misses were
     // always single.
@@ -421,7 +421,7 @@ fn a_writer_whose_messages_polling_misses_may_seem_silent_for_long() {
     assert!(one > 200.0, "{one}");
     let mut bench = Bench::new(RELIABLE);
     bench.data(1).wait(1000).data(2);
-    assert_eq!(bench.writer.seeming_silence(slowest), Duration::ZERO);
+    assert_eq!(bench.writer.max_unseen_time(slowest), Duration::ZERO);
 }
 
 #[test]
@@ -499,7 +499,7 @@ fn a_sample_that_arrived_half_by_network_is_not_lost_in_shared_memory() {
     assert_eq!((facts.messages, facts.lost, facts.incomplete), (2, 0, 0));
 }
 
-fn in_its_process(record: Record) -> Record {
+fn with_intra_process(record: Record) -> Record {
     Record {
         flags: flag::SHM | flag::EXACT,
         ..record
@@ -510,7 +510,7 @@ fn in_its_process(record: Record) -> Record {
 fn with_uprobes_gaps_count_as_losses_and_copies_do_not_count_again() {
     let mut bench = Bench::new(Traits::default());
     for number in [1, 2, 3, 5, 6] {
-        bench.put(in_its_process(data(number)));
+        bench.put(with_intra_process(data(number)));
         // The sample goes to another host by the network, and is read from shared memory.
         bench.data(number);
         bench.put(in_shared_memory(data(number))).wait(10);
@@ -530,7 +530,7 @@ fn messages_from_before_uprobes_began_count_by_the_span_of_their_numbers() {
         bench.put(in_shared_memory(data(number))).wait(10);
     }
     for number in [10, 11, 13, 14] {
-        bench.put(in_its_process(data(number))).wait(10);
+        bench.put(with_intra_process(data(number))).wait(10);
     }
     let facts = bench.wait(5_000).facts();
     let sampled = facts.sampled.unwrap();
@@ -549,7 +549,7 @@ fn messages_from_before_uprobes_began_count_by_the_span_of_their_numbers() {
 fn when_uprobes_end_messages_in_shared_memory_count_immediately() {
     let mut bench = Bench::new(Traits::default());
     for number in [1, 2, 3] {
-        bench.put(in_its_process(data(number))).wait(10);
+        bench.put(with_intra_process(data(number))).wait(10);
     }
     bench.put(in_shared_memory(data(3)));
     bench.writer.end_exact_view();
@@ -567,14 +567,14 @@ fn when_uprobes_end_a_writer_is_unseen_until_another_view_shows_a_sample() {
     let mut bench = Bench::new(Traits::default());
     assert!(bench.writer.is_unseen());
     bench.writer.end_exact_view();
-    bench.put(in_its_process(data(1))).wait(1000);
+    bench.put(with_intra_process(data(1))).wait(1000);
     assert!(!bench.writer.is_unseen());
     for (number, in_view) in [
         (3, in_shared_memory as fn(Record) -> Record),
-        (5, in_its_process),
+        (5, with_intra_process),
         (7, |record| record),
     ] {
-        bench.put(in_its_process(data(number - 1))).wait(1000);
+        bench.put(with_intra_process(data(number - 1))).wait(1000);
         bench.writer.end_exact_view();
         assert!(bench.writer.is_unseen(), "{number}");
         bench.put(in_view(data(number))).wait(1000);
@@ -583,7 +583,7 @@ fn when_uprobes_end_a_writer_is_unseen_until_another_view_shows_a_sample() {
 }
 
 /// Returns a record of a sample in three fragments.
-fn third(number: u64, start: u32) -> Record {
+fn every_third(number: u64, start: u32) -> Record {
     Record {
         sample_size: 2500,
         ..fragment(number, start)
@@ -592,7 +592,7 @@ fn third(number: u64, start: u32) -> Record {
 
 /// Returns records of the samples `1..=4`, each in three fragments.
 fn thirds() -> Vec<Record> {
-    let starts = |number| (1..=3).map(move |start| third(number, start));
+    let starts = |number| (1..=3).map(move |start| every_third(number, start));
     (1..=4).flat_map(starts).collect()
 }
 
@@ -656,7 +656,7 @@ fn every_sample_is_counted_or_missed(
 fn a_sample_in_transit_when_uprobes_begin_is_counted() {
     let records = thirds();
     let looked: Vec<_> = records.iter().copied().map(in_shared_memory).collect();
-    let exact: Vec<_> = records.into_iter().map(in_its_process).collect();
+    let exact: Vec<_> = records.into_iter().map(with_intra_process).collect();
     for begins in 0..exact.len() {
         for ends in begins.max(1)..exact.len() {
             let fewest =
@@ -670,7 +670,11 @@ fn a_sample_in_transit_when_uprobes_begin_is_counted() {
 fn a_sample_in_transit_when_uprobes_begin_is_not_captured_if_a_part_is_missing() {
     let records = thirds();
     let looked = [in_shared_memory(records[0])];
-    let exact: Vec<_> = records[2..].iter().copied().map(in_its_process).collect();
+    let exact: Vec<_> = records[2..]
+        .iter()
+        .copied()
+        .map(with_intra_process)
+        .collect();
     let fewest = every_sample_is_counted_or_missed(&looked, &exact, |_| {}, false);
     assert_eq!(fewest, [0, 1, 1, 1]);
 }
@@ -682,7 +686,7 @@ fn a_sample_in_transit_when_uprobes_end_is_counted_by_polling() {
         let exact: Vec<_> = records[..ends]
             .iter()
             .copied()
-            .map(in_its_process)
+            .map(with_intra_process)
             .collect();
         let looked: Vec<_> = records[ends..]
             .iter()

@@ -38,12 +38,12 @@ impl Observer {
                 },
             };
             self.read(found, sample, vendor, &origin);
-            self.follow_up(origin.at);
+            self.apply_discovery_changes(origin.at);
             self.identify_call(found, sample, vendor);
             self.keep_type_source(found, sample, vendor);
             self.keep_payload(sample, found.payload);
             let call = |half| services::call(half, found, sample, vendor);
-            self.hear_robot(sample, found.payload, vendor, call);
+            self.read_robot_sample(sample, found.payload, vendor, call);
         }
     }
 

@@ -19,8 +19,8 @@ impl Observer {
         }
     }
 
-    /// Keeps a captured response of `get_type_description`, or a reply of the TypeLookup service, once
-    /// it is whole.
+    /// Keeps a captured response of `get_type_description`, or a reply of the TypeLookup service,
+    /// once it is whole.
     pub(super) fn keep_type_source(
         &mut self,
         found: &Found<'_>,
@@ -56,7 +56,7 @@ impl Observer {
 
     /// Stops capturing a writer of requests or replies that has exceeded its budget.
     pub(super) fn follow_call(&mut self, writer: Guid, is_over_budget: bool) {
-        if is_over_budget && !self.measure.payloads.wants_bytes(writer) {
+        if is_over_budget && !self.measure.payloads.needs_payload(writer) {
             let is_measured = self.measure.profiler.get(writer).is_some();
             let verdict = match is_measured {
                 true => Verdict::Meter,
@@ -67,7 +67,7 @@ impl Observer {
     }
 
     /// Counts a copy of a request or reply.
-    pub(super) fn call_seen(&mut self, sample: &Sample) {
+    pub(super) fn count_call(&mut self, sample: &Sample) {
         if self.derive.services.follows(sample.head.writer) {
             let (receivers, discovery) = (&self.graph.receivers, &self.graph.discovery);
             let services = &mut self.derive.services;

@@ -16,7 +16,7 @@ use crate::measure::writer::Counted;
 
 impl Observer {
     /// Adds the message that this sample completed to the chains, and records where it arrived.
-    pub(super) fn chain_seen(&mut self, sample: &Sample, completed: Option<&Counted>) {
+    pub(super) fn add_to_chains(&mut self, sample: &Sample, completed: Option<&Counted>) {
         let (writer, clock) = (sample.head.writer, self.graph.wall_clock);
         if !self.derive.chains.follows(writer) {
             return;
@@ -32,7 +32,7 @@ impl Observer {
     }
 
     /// Adds a publication within a callback to the chains.
-    pub(super) fn chain_published(&mut self, publication: &CausalPublication) {
+    pub(super) fn add_causal_publication(&mut self, publication: &CausalPublication) {
         let Derive {
             chains,
             tracer,

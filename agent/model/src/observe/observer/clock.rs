@@ -8,11 +8,11 @@ use ros2probe_wire::record::Verdict;
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, Timestamp};
 
-use super::JUMP;
+use super::MAX_CLOCK_STEP;
 use super::Observer;
 use super::TICK;
 use crate::facts::diagnosis;
-use crate::facts::event::{EventKind, TEXT, bounded, bounded_finding};
+use crate::facts::event::{EventKind, MAX_TEXT, bounded_finding, truncated};
 use crate::facts::loss_share::LossShare;
 use crate::facts::measurement::Measurement;
 use crate::facts::model_time::ModelTime;
@@ -26,7 +26,7 @@ use crate::report::transport::is_polled;
 impl Observer {
     /// Advances the time: expires leases, settles gaps, evaluates expectations.
     pub(super) fn advance(&mut self, now: ModelTime) {
-        if self.clock == ModelTime::ZERO || now - self.clock > JUMP {
+        if self.clock == ModelTime::ZERO || now - self.clock > MAX_CLOCK_STEP {
             self.clock = now.round_down(TICK);
             self.tick(self.clock);
         }
@@ -62,7 +62,7 @@ impl Observer {
             .settle(self.clock, &mut self.journal, graph);
         self.report_missing();
         for writer in self.measure.payloads.unsettled() {
-            self.measure.payloads.give_all(writer, self.clock);
+            self.measure.payloads.dispatch_all(writer, self.clock);
         }
         self.end_second_of_losses();
         self.report_losses();
@@ -89,7 +89,7 @@ impl Observer {
                 let Some(receivers) = &mut measured.subscribers else {
                     continue;
                 };
-                topic.loss.leave(receivers.take_departed());
+                topic.loss.note_departed(receivers.take_departed());
                 for (receiver, recent) in receivers.losses() {
                     let (window, last) = subscribers.entry(receiver).or_default();
                     window.add(recent.window());
@@ -114,16 +114,16 @@ impl Observer {
         let discovery = &graph.discovery;
         self.journal.events.end_bursts(|burst| {
             if let Some(endpoint) = discovery.endpoints().get(&burst.writer) {
-                burst.topic = Some((endpoint.domain_id, endpoint.topic.bounded(TEXT)));
+                burst.topic = Some((endpoint.domain_id, endpoint.topic.bounded(MAX_TEXT)));
             }
             let node = discovery.node_of(graph.base_of(burst.writer));
-            burst.node = node.map(|node| node.name.bounded(TEXT));
+            burst.node = node.map(|node| node.name.bounded(MAX_TEXT));
         });
     }
 
     pub(super) fn tick(&mut self, now: ModelTime) {
         self.graph.discovery.advance(now, &mut self.journal);
-        self.follow_up(now);
+        self.apply_discovery_changes(now);
         let graph = &self.graph;
         let unknown_writers = self.measure.profiler.advance(now, &mut self.journal, graph);
         for guid in unknown_writers.metered {
@@ -140,11 +140,11 @@ impl Observer {
             self.measure.links.end_second(now);
             self.measure.payloads.expire(now);
             for writer in self.measure.latched.advance(now) {
-                self.apply_again(writer, now);
+                self.apply_lists_to_latched(writer, now);
             }
             self.end_second_of_clocks(now);
             for writer in self.derive.robot.end_second(now, &mut self.journal.events) {
-                self.apply_again(writer, now);
+                self.apply_lists_to_latched(writer, now);
             }
             let profiler = &self.measure.profiler;
             self.measure.payloads.retain_unknown_writers(|writer| {
@@ -154,12 +154,12 @@ impl Observer {
             self.graph.topics.expire(now, self.settings.topic_grace);
             self.link_sessions();
             self.end_unreachable_sessions(now);
-            self.graph.receivers.tidy(&self.graph.discovery);
+            self.graph.receivers.remove_unknown(&self.graph.discovery);
             self.graph
                 .discovery
-                .locate(|prefix| self.graph.receivers.is_local(prefix));
+                .update_locality(|prefix| self.graph.receivers.is_local(prefix));
             self.settle_inside(now);
-            self.promote();
+            self.assign_free_slots();
             self.end_second_of_losses();
             self.judge(now);
             self.advance_calls(now);
@@ -246,7 +246,7 @@ impl Observer {
             };
             let seeming_silence = |slowest| {
                 let polled = writers.iter();
-                let longest = polled.map(|each| each.writer.seeming_silence(slowest));
+                let longest = polled.map(|each| each.writer.max_unseen_time(slowest));
                 let longest = longest.max().unwrap_or_default();
                 let is_unseen = |guid: &&Guid| {
                     let known = self.measure.profiler.get(**guid);
@@ -254,7 +254,7 @@ impl Observer {
                 };
                 let mut unseen = topic.writers.iter().filter(is_unseen);
                 match unseen.any(|guid| is_polled(&self.graph.discovery, *guid, &topic.readers)) {
-                    true => longest.max(Sampled::seeming_silence_of_unseen(slowest)),
+                    true => longest.max(Sampled::max_unseen_time_of_new_writer(slowest)),
                     false => longest,
                 }
             };
@@ -268,7 +268,7 @@ impl Observer {
                 publishers: topic.writers.len().max(publishers),
                 subscriptions: topic.readers.len().max(subscriptions),
                 last_message,
-                seeming_silence,
+                max_unseen_time: seeming_silence,
                 since: topic.published,
                 observed: topic.published.max(topic.subscribed).max(self.view_began),
                 recent,
@@ -285,8 +285,8 @@ impl Observer {
                 let (domain_id, name) = (topic.domain_id, &topic.naming.name);
                 let kind = EventKind::Expectation {
                     domain_id,
-                    topic: name.bounded(TEXT),
-                    watch: bounded(&watch.pattern).into(),
+                    topic: name.bounded(MAX_TEXT),
+                    watch: truncated(&watch.pattern).into(),
                     from,
                     to,
                     violations: judgement.violations(),
@@ -295,8 +295,8 @@ impl Observer {
                 if to == WatchState::Silent {
                     let kind = EventKind::Silence {
                         domain_id,
-                        topic: name.bounded(TEXT),
-                        watch: bounded(&watch.pattern).into(),
+                        topic: name.bounded(MAX_TEXT),
+                        watch: truncated(&watch.pattern).into(),
                         last_message: last_message.map(|at| self.graph.wall_clock.wall_time(at)),
                     };
                     self.journal.events.push(now, kind);

@@ -19,7 +19,7 @@ impl Observer {
         match observation {
             Observation::Sample(sample) => self.clock_of_sample(sample),
             Observation::AckNack(acknack) => self.clock_of_acknack(acknack),
-            Observation::Heartbeat(heartbeat) if heartbeat.head.leaves() => {
+            Observation::Heartbeat(heartbeat) if heartbeat.head.is_outgoing() => {
                 let Heartbeat { head, last, .. } = heartbeat;
                 self.derive.clocks.announced(head.writer, *last, head.at);
             }
@@ -46,7 +46,7 @@ impl Observer {
     }
 
     /// Compares the stamp of a measured message with the time of its publication.
-    pub(super) fn judge_stamp(&mut self, observation: &Observation) {
+    pub(super) fn check_stamp(&mut self, observation: &Observation) {
         let Observation::Sample(sample) = observation else {
             return;
         };
@@ -87,9 +87,9 @@ impl Observer {
 
     fn clock_of_sample(&mut self, sample: &Sample) {
         let head = &sample.head;
-        if head.leaves() {
+        if head.is_outgoing() {
             let number = sample.sequence_number;
-            self.derive.clocks.left(head.writer, number, head.at);
+            self.derive.clocks.note_sent(head.writer, number, head.at);
             return;
         }
         // Announcements are repeated with old stamps, and only the first fragment follows its stamp
@@ -116,7 +116,7 @@ impl Observer {
         let head = &acknack.head;
         let participants = self.graph.discovery.participants();
         let writer = participants.get(&head.writer.prefix);
-        if !head.leaves()
+        if !head.is_outgoing()
             && writer.is_some_and(|writer| writer.local)
             && let Some(address) = self.remote_address(&head.reader.prefix)
         {
@@ -137,7 +137,7 @@ impl Observer {
             && let Some(address) = self.remote_address(&sample.head.writer.prefix)
         {
             let now = sample.head.at;
-            self.derive.clocks.replied(address, stamp, sent, now);
+            self.derive.clocks.note_reply(address, stamp, sent, now);
         }
     }
 

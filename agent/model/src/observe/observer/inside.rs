@@ -64,7 +64,8 @@ impl Observer {
                 continue;
             }
             if is_live {
-                let (place, is_new) = match topics.hold(domain_id, naming, limit, now) {
+                let (place, is_new) = match topics.keep_process_topic(domain_id, naming, limit, now)
+                {
                     Some(held) => held,
                     None => continue,
                 };

@@ -213,7 +213,7 @@ impl Observer {
                 let is_read = self.derive.robot.is_captured(guid);
                 let verdict = match topic.naming.kind {
                     TopicKind::Discovery => Verdict::Capture,
-                    _ if measured && counts && wants_bytes(topic) => Verdict::Capture,
+                    _ if measured && counts && needs_payload(topic) => Verdict::Capture,
                     _ if is_call || is_read || latched == Some(Verdict::Capture) => {
                         Verdict::Capture
                     }
@@ -228,7 +228,7 @@ impl Observer {
                         let next = known.map_or(SequenceNumber::ZERO, |known| known.writer.next());
                         self.measure
                             .payloads
-                            .want(guid, topic, requested, (next, now), is_new);
+                            .start_writer(guid, topic, requested, (next, now), is_new);
                     }
                     _ => self.measure.payloads.release(guid, now),
                 }
@@ -246,7 +246,7 @@ impl Observer {
     }
 
     /// Applies the decision about its topic to a writer whose last message is kept.
-    pub(super) fn apply_again(&mut self, writer: Guid, now: ModelTime) {
+    pub(super) fn apply_lists_to_latched(&mut self, writer: Guid, now: ModelTime) {
         let endpoint = self.graph.discovery.endpoints().get(&writer);
         let id = endpoint.and_then(|endpoint| {
             let naming = endpoint.naming()?;
@@ -307,7 +307,7 @@ impl Observer {
     }
 
     /// Assigns free measuring slots, and those of vanished topics, to rejected topics.
-    pub(super) fn promote(&mut self) {
+    pub(super) fn assign_free_slots(&mut self) {
         if !self.graph.topics.has_place(self.settings.topics) {
             return;
         }
@@ -327,7 +327,7 @@ impl Observer {
 }
 
 /// Returns whether a subscription requests the payloads of the topic.
-pub(super) fn wants_bytes(topic: &Topic) -> bool {
+pub(super) fn needs_payload(topic: &Topic) -> bool {
     let requested = topic.requested.as_ref();
     requested.is_some_and(|requested| !requested.payloads.is_empty())
 }

@@ -13,7 +13,7 @@ use crate::measure::topic::Accelerated;
 
 /// Time after which another subscription's references count. It is longer than the time between the
 /// copies for one message.
-const PAUSE: Duration = Duration::from_millis(100);
+const COPY_GRACE: Duration = Duration::from_millis(100);
 
 /// The writers of references, and whose references count.
 #[derive(Debug, Default)]
@@ -83,7 +83,7 @@ impl References {
             lead.at = at;
             return CountedAs::Message;
         }
-        if at <= lead.at + PAUSE {
+        if at <= lead.at + COPY_GRACE {
             return CountedAs::Copy;
         }
         *lead = Lead { channel, at };

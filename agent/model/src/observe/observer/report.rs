@@ -195,11 +195,11 @@ fn topic(
             buffers: buffers.into(),
         })
     };
-    let mut publishers = fitting(
+    let mut publishers = with_exact_capacity(
         topic.writers.len(),
         topic.writers.iter().filter_map(endpoint),
     );
-    let mut subscriptions = fitting(
+    let mut subscriptions = with_exact_capacity(
         topic.readers.len(),
         topic.readers.iter().filter_map(endpoint),
     );
@@ -299,7 +299,7 @@ fn apart(
 }
 
 /// Collects with exact capacity: most topics have one endpoint, and `collect` would allocate four.
-fn fitting<T>(length: usize, items: impl Iterator<Item = T>) -> Vec<T> {
+fn with_exact_capacity<T>(length: usize, items: impl Iterator<Item = T>) -> Vec<T> {
     let mut list = Vec::with_capacity(length);
     list.extend(items);
     list
@@ -315,7 +315,7 @@ fn unknown_writers(observer: &Observer, now: ModelTime) -> Vec<UnknownWriterFact
         .map(|(guid, measured)| {
             let participant = observer.graph.discovery.participants().get(&guid.prefix);
             let proxy = participant.map(|participant| &participant.proxy);
-            let holder = observer.graph.receivers.sockets().get(measured.sent_from);
+            let holder = observer.graph.receivers.sockets().get(measured.socket);
             UnknownWriterFacts {
                 guid: *guid,
                 vendor: vendor(*guid, proxy),

@@ -8,7 +8,7 @@ use ros2probe_wire::names::DdsTopic;
 use ros2probe_wire::rtps::VendorId;
 
 use super::Observer;
-use crate::derive::robot::Heard;
+use crate::derive::robot::ReadOutcome;
 use crate::derive::services::Half;
 use crate::derive::services::service::CallId;
 use crate::facts::dispatch::{self, Dispatch, SampleOutcome};
@@ -35,7 +35,7 @@ impl Observer {
     /// missing.
     #[must_use]
     pub fn dispatched_until(&self, now: Timestamp) -> Timestamp {
-        let writers = self.measure.payloads.wanted();
+        let writers = self.measure.payloads.requested_writers();
         let writers = writers.filter_map(|writer| self.measure.profiler.get(*writer));
         let unseen = writers.filter_map(|measured| measured.writer.unseen_since());
         unseen.fold(now, |until, since| {
@@ -61,7 +61,7 @@ impl Observer {
         profiler.settle_sampled(self.clock, &mut self.journal, graph);
         self.report_missing();
         for writer in self.measure.payloads.unsettled() {
-            self.measure.payloads.give_all(writer, self.clock);
+            self.measure.payloads.dispatch_all(writer, self.clock);
         }
     }
 
@@ -70,7 +70,7 @@ impl Observer {
         if self.requested.sample_requests.is_empty() {
             return;
         }
-        if !self.measure.payloads.wants(writer) {
+        if !self.measure.payloads.is_requested(writer) {
             let known = self.measure.profiler.get(writer);
             if known.is_some_and(|known| known.topic.is_none()) {
                 let sample_requests = self
@@ -90,7 +90,7 @@ impl Observer {
                 }
                 self.measure
                     .payloads
-                    .counted_of_unknown_writer(writer, number, sample_requests);
+                    .note_unknown_writer(writer, number, sample_requests);
             }
             return;
         }
@@ -105,14 +105,14 @@ impl Observer {
     }
 
     /// Dispatches a retransmitted sample that was first counted before its writer's announcement.
-    pub(super) fn came_again(&mut self, sample: &Sample) {
+    pub(super) fn note_retransmitted(&mut self, sample: &Sample) {
         let (writer, at) = (sample.head.writer, sample.head.at);
         let number = sample.sequence_number;
         let stamp = match sample.content {
             Content::Data { .. } => sample.header_stamp,
             Content::DataFrag(_) => None,
         };
-        if !sample.is_delivered() || !self.measure.payloads.lacks(writer, number) {
+        if !sample.is_delivered() || !self.measure.payloads.is_undispatched(writer, number) {
             return;
         }
         let has_header = |known: &Measured| known.writer.traits().has_header;
@@ -128,12 +128,12 @@ impl Observer {
         };
         let progress = self.measure.profiler.progress(writer, at, &self.graph);
         if let Some(progress) =
-            progress.filter(|_| sample.is_end() || self.measure.payloads.wants_bytes(writer))
+            progress.filter(|_| sample.is_end() || self.measure.payloads.needs_payload(writer))
         {
             let skip = self
                 .measure
                 .payloads
-                .came_again(writer, &counted, &progress);
+                .dispatch_retransmitted(writer, &counted, &progress);
             self.skip(writer, skip);
         }
     }
@@ -142,23 +142,26 @@ impl Observer {
     pub(super) fn turn(&mut self, writer: Guid, now: ModelTime) {
         let progress = self.measure.profiler.progress(writer, now, &self.graph);
         if let Some(progress) = progress {
-            let skip = self.measure.payloads.turn(writer, &progress, now);
+            let skip = self.measure.payloads.dispatch_ready(writer, &progress, now);
             self.skip(writer, skip);
         }
     }
 
     pub(super) fn skip(&mut self, writer: Guid, number: Option<SequenceNumber>) {
         if let Some(number) = number {
-            self.measure.profiler.skip(writer, number);
+            self.measure.profiler.settle_below(writer, number);
         }
     }
 
     /// Keeps the payload of a sample that is not counted yet, if it is requested.
     pub(super) fn keep_payload(&mut self, sample: &Sample, payload: &[u8]) {
         let writer = sample.head.writer;
-        if self.measure.payloads.wants_bytes(writer) {
+        if self.measure.payloads.needs_payload(writer) {
             let known = self.measure.profiler.get(writer);
-            let lacks = self.measure.payloads.lacks(writer, sample.sequence_number);
+            let lacks = self
+                .measure
+                .payloads
+                .is_undispatched(writer, sample.sequence_number);
             if lacks || known.is_some_and(|known| !known.writer.has(sample)) {
                 self.measure.payloads.keep(sample, payload);
             }
@@ -168,12 +171,12 @@ impl Observer {
                 .latched
                 .put(sample, self.graph.wall_clock, payload)
         {
-            self.apply_again(writer, sample.head.at);
+            self.apply_lists_to_latched(writer, sample.head.at);
         }
     }
 
     /// Reads a sample of a standard type, in which the robot itself says something.
-    pub(super) fn hear_robot(
+    pub(super) fn read_robot_sample(
         &mut self,
         sample: &Sample,
         payload: &[u8],
@@ -186,11 +189,13 @@ impl Observer {
         }
         let node = self.graph.discovery.node_of(writer).map(|node| &node.name);
         let events = &mut self.journal.events;
-        match (self.derive.robot).hear(sample, payload, (node, vendor), call, events) {
-            Heard::Nothing | Heard::Decoded => {}
-            Heard::Paused => self.apply_again(writer, sample.head.at),
-            Heard::Transition(from, node) => self.note_transition(from, node),
-            Heard::Malformed(standard, error) => self.decode_error(standard.stage(), error.reason),
+        match (self.derive.robot).read_sample(sample, payload, (node, vendor), call, events) {
+            ReadOutcome::Nothing | ReadOutcome::Decoded => {}
+            ReadOutcome::Paused => self.apply_lists_to_latched(writer, sample.head.at),
+            ReadOutcome::Transition(from, node) => self.note_transition(from, node),
+            ReadOutcome::Malformed(standard, error) => {
+                self.decode_error(standard.stage(), error.reason);
+            }
         }
     }
 
@@ -222,7 +227,7 @@ impl Observer {
             let is_recent = *at >= self.requested.requests_changed;
             let writer = sample.writer;
             covers(sample)
-                && (self.measure.payloads).give_before(writer, (request.id, number), is_recent)
+                && (self.measure.payloads).dispatch_latched(writer, (request.id, number), is_recent)
         });
         let samples = samples.into_iter().map(|(at, mut sample)| {
             let time = self.graph.wall_clock.wall_time(at);

@@ -15,7 +15,7 @@ use crate::facts::observation::{Content, DatagramFate, Head, Observation, Path, 
 use crate::facts::route::Direction;
 use crate::graph::discovery::{Origin, Priority};
 use crate::graph::zenoh::{
-    GraphChange, Holder, Shown, StreamId, StreamReport, ZenohSample, unknown_guid,
+    GraphChange, Holder, ReportFact, StreamId, StreamReport, ZenohSample, unknown_guid,
 };
 use crate::measure::topic::Accelerated;
 
@@ -43,32 +43,34 @@ impl Observer {
         let mut zenoh = std::mem::take(&mut self.zenoh);
         let at = self.graph.wall_clock.model_time(report.time);
         let mut alive = None;
-        let wants_bytes = self.measure.payloads.wants_any_bytes()
+        let wants_bytes = self.measure.payloads.needs_any_payload()
             || self.measure.latched.is_used()
             || self.derive.robot.is_used();
         // A sample may precede its writer's announcement in a batch. It then has an unknown writer.
         zenoh.report(report, at, wants_bytes, &mut |shown| match shown {
-            Shown::Sample(sample) => self.zenoh_sample(report.stream, at, sample),
-            Shown::Owner(socket, prefix) => self.graph.receivers.sends(socket, prefix),
-            Shown::Disowned(socket, prefix) => self.graph.receivers.sends_no_longer(socket, prefix),
-            Shown::Alive(session) => alive = Some(session),
-            Shown::Relayed(session) => {
+            ReportFact::Sample(sample) => self.zenoh_sample(report.stream, at, sample),
+            ReportFact::Owner(socket, prefix) => self.graph.receivers.add_owner(socket, prefix),
+            ReportFact::Disowned(socket, prefix) => {
+                self.graph.receivers.remove_owner(socket, prefix);
+            }
+            ReportFact::Alive(session) => alive = Some(session),
+            ReportFact::Relayed(session) => {
                 self.graph
                     .discovery
-                    .seen(session.guid_prefix(), at, Priority::NOTHING);
+                    .seen(session.guid_prefix(), at, Priority::NO_EVIDENCE);
             }
-            Shown::Missed(destination) => {
+            ReportFact::Missed(destination) => {
                 self.measure.profiler.missed(destination, at);
             }
-            Shown::Malformed(reason) => self.decode_error("zenoh", reason),
+            ReportFact::Malformed(reason) => self.decode_error("zenoh", reason),
         });
         if let Some(session) = alive {
             let prefix = session.guid_prefix();
             match self.graph.discovery.knows(prefix) {
                 true => {
-                    self.graph.discovery.seen(prefix, at, Priority::NOTHING);
+                    self.graph.discovery.seen(prefix, at, Priority::NO_EVIDENCE);
                 }
-                false => zenoh.graph.repeat(session, at),
+                false => zenoh.graph.announce_again(session, at),
             }
         }
         self.zenoh = zenoh;
@@ -97,12 +99,12 @@ impl Observer {
             if let Some(before) = change.before {
                 self.graph
                     .receivers
-                    .sends_no_longer(change.socket, before.guid_prefix());
+                    .remove_owner(change.socket, before.guid_prefix());
             }
             if let Some(after) = change.after {
                 self.graph
                     .receivers
-                    .sends(change.socket, after.guid_prefix());
+                    .add_owner(change.socket, after.guid_prefix());
             }
         }
     }
@@ -159,7 +161,9 @@ impl Observer {
                     self.learn_participant(&announcement, &origin);
                     // The sockets of a session without tokens are not remembered.
                     for socket in self.zenoh.sockets(announcement.guid.prefix) {
-                        self.graph.receivers.sends(socket, announcement.guid.prefix);
+                        self.graph
+                            .receivers
+                            .add_owner(socket, announcement.guid.prefix);
                     }
                 }
                 GraphChange::ParticipantGone(guid) => {
@@ -185,7 +189,7 @@ impl Observer {
                 }
             }
         }
-        self.follow_up(at);
+        self.apply_discovery_changes(at);
     }
 
     /// Assigns the samples that a writer sent while its token was unknown to the announced writer.
@@ -193,7 +197,9 @@ impl Observer {
         if announcement.role == Role::Writer {
             let before = unknown_guid(Gid(announcement.gid));
             self.measure.profiler.rename(before, announcement.guid);
-            self.measure.payloads.rename(before, announcement.guid);
+            self.measure
+                .payloads
+                .rename_unknown_writer(before, announcement.guid);
             self.requested.interest.remove(before);
         }
     }
@@ -227,7 +233,7 @@ impl Observer {
                 let client = client.0;
                 Some(CallId { client, number })
             };
-            self.hear_robot(&observed, payload, VendorId::default(), call);
+            self.read_robot_sample(&observed, payload, VendorId::default(), call);
         }
         self.observe(&Observation::Sample(observed));
         if stream.outgoing && stream.is_loopback() {

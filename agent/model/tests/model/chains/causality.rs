@@ -68,7 +68,7 @@ fn publications_within_callbacks_are_joined_by_their_messages() {
 }
 
 #[test]
-fn a_chain_from_a_message_without_a_source_timestamp_begins_at_its_take() {
+fn a_chain_from_a_message_without_a_source_timestamp_begins_when_it_is_taken() {
     let mut robot = Robot::new();
     robot.start();
     for index in 0..10 {

@@ -53,7 +53,7 @@ fn exact_stamps_of_fifty_unrelated_nodes_yield_no_hop() {
 }
 
 #[test]
-fn rounded_stamps_of_timers_yield_no_hop_whatever_the_phases() {
+fn rounded_stamps_of_timers_yield_no_hop_at_any_phase() {
     let rounded = |at: u64| at - at % (100 * MILLISECOND);
     let fixed = crowd(rounded, |_, number| (number + 1) * MILLISECOND);
     assert_eq!(hops(&fixed.chains()), [""; 0]);

@@ -258,7 +258,7 @@ fn a_gap_within_one_tcp_connection_is_the_senders() {
 }
 
 #[test]
-fn a_sample_missing_between_two_tcp_connections_may_have_been_under_way() {
+fn a_sample_missing_between_two_tcp_connections_may_have_been_in_transit() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     for (source_port, number) in [(5100, 1), (5100, 2), (5101, 5), (5101, 7)] {

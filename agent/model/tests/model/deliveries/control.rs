@@ -121,7 +121,7 @@ fn a_sample_that_a_short_history_overwrote_before_it_arrived_is_lost() {
 }
 
 #[test]
-fn an_unseen_sample_that_its_reader_acknowledged_is_not_lost() {
+fn an_acknowledged_sample_that_was_not_captured_is_not_lost() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     for number in 1..=101 {

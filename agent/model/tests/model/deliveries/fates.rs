@@ -8,7 +8,7 @@ use ros2probe_wire::record::{flag, kind};
 
 /// The fate of one sample.
 #[derive(Clone, Copy, Debug, PartialEq)]
-enum Fate {
+enum SampleFate {
     Arrives,
     ArrivesTwice,
     BeforeHost,
@@ -19,20 +19,20 @@ enum Fate {
     RepairedAfterDrop,
     /// Retransmitted, and dropped again by a full buffer.
     RepairDropped,
-    Excused,
+    Irrelevant,
 }
 
-fn fate() -> impl Strategy<Value = Fate> {
+fn fate() -> impl Strategy<Value = SampleFate> {
     prop_oneof![
-        12 => Just(Fate::Arrives),
-        1 => Just(Fate::ArrivesTwice),
-        2 => Just(Fate::BeforeHost),
-        2 => Just(Fate::SocketFull),
-        1 => Just(Fate::Reassembly),
-        2 => Just(Fate::Repaired),
-        1 => Just(Fate::RepairedAfterDrop),
-        1 => Just(Fate::RepairDropped),
-        1 => Just(Fate::Excused),
+        12 => Just(SampleFate::Arrives),
+        1 => Just(SampleFate::ArrivesTwice),
+        2 => Just(SampleFate::BeforeHost),
+        2 => Just(SampleFate::SocketFull),
+        1 => Just(SampleFate::Reassembly),
+        2 => Just(SampleFate::Repaired),
+        1 => Just(SampleFate::RepairedAfterDrop),
+        1 => Just(SampleFate::RepairDropped),
+        1 => Just(SampleFate::Irrelevant),
     ]
 }
 
@@ -72,21 +72,21 @@ proptest! {
             let whole = arrival(&host, bob, number, *fragmented, false);
             let part = arrival(&host, bob, number, *fragmented, true);
             match fate {
-                Fate::Arrives => host.put(whole),
-                Fate::ArrivesTwice => {
+                SampleFate::Arrives => host.put(whole),
+                SampleFate::ArrivesTwice => {
                     host.put(whole);
                     host.put(whole);
                 }
-                Fate::BeforeHost => {}
-                Fate::SocketFull | Fate::RepairedAfterDrop => {
+                SampleFate::BeforeHost => {}
+                SampleFate::SocketFull | SampleFate::RepairedAfterDrop => {
                     host.put(socket_full(part));
                     host.put(whole);
                 }
-                Fate::Reassembly => given_up.push(number),
-                Fate::Repaired | Fate::RepairDropped => {}
-                Fate::Excused => host.gap(bob, number),
+                SampleFate::Reassembly => given_up.push(number),
+                SampleFate::Repaired | SampleFate::RepairDropped => {}
+                SampleFate::Irrelevant => host.gap(bob, number),
             }
-            if matches!(fate, Fate::Repaired | Fate::RepairedAfterDrop | Fate::RepairDropped) {
+            if matches!(fate, SampleFate::Repaired | SampleFate::RepairedAfterDrop | SampleFate::RepairDropped) {
                 repairs.push((number, *fate, *fragmented));
             }
             // Retransmissions follow some samples later.
@@ -108,7 +108,7 @@ proptest! {
         // Unknown causes are pending, and no sample is awaited any longer.
         let facts = host.deliveries()[0].delivered;
         prop_assert_eq!(facts.messages - facts.history + facts.lost() + facts.irrelevant, sent);
-        let unknown = fates.iter().filter(|(fate, ..)| matches!(fate, Fate::BeforeHost | Fate::Reassembly));
+        let unknown = fates.iter().filter(|(fate, ..)| matches!(fate, SampleFate::BeforeHost | SampleFate::Reassembly));
         prop_assert_eq!(facts.pending, unknown.count() as u64);
         for number in given_up {
             host.put(Record {
@@ -120,29 +120,29 @@ proptest! {
         for _ in 0..40 {
             host.wait(1000);
         }
-        let with = |wanted: &[Fate]| -> Vec<u64> {
+        let with = |wanted: &[SampleFate]| -> Vec<u64> {
             let fates = (2..).zip(&fates);
             fates.filter(|(_, (fate, ..))| wanted.contains(fate)).map(|(number, _)| number).collect()
         };
-        prop_assert_eq!(host.losses(LossCause::BeforeHost), with(&[Fate::BeforeHost]));
-        prop_assert_eq!(host.losses(LossCause::Reassembly), with(&[Fate::Reassembly]));
-        let full = with(&[Fate::SocketFull, Fate::RepairDropped]);
+        prop_assert_eq!(host.losses(LossCause::BeforeHost), with(&[SampleFate::BeforeHost]));
+        prop_assert_eq!(host.losses(LossCause::Reassembly), with(&[SampleFate::Reassembly]));
+        let full = with(&[SampleFate::SocketFull, SampleFate::RepairDropped]);
         prop_assert_eq!(host.losses(LossCause::SocketBuffer), full);
         let facts = host.deliveries()[0].delivered;
-        let repaired = with(&[Fate::Repaired, Fate::RepairedAfterDrop]).len();
+        let repaired = with(&[SampleFate::Repaired, SampleFate::RepairedAfterDrop]).len();
         prop_assert_eq!(facts.recovered, repaired as u64);
-        prop_assert_eq!(facts.irrelevant, with(&[Fate::Excused]).len() as u64);
-        prop_assert_eq!(facts.duplicates, with(&[Fate::ArrivesTwice]).len() as u64);
+        prop_assert_eq!(facts.irrelevant, with(&[SampleFate::Irrelevant]).len() as u64);
+        prop_assert_eq!(facts.duplicates, with(&[SampleFate::ArrivesTwice]).len() as u64);
         prop_assert_eq!(facts.messages + facts.lost() + facts.irrelevant, sent);
         prop_assert_eq!(host.topic().received.map(|sum| *sum), Some(facts));
     }
 }
 
-fn repair(host: &mut Host, bob: CapturePoint, number: u64, fate: Fate, fragmented: bool) {
+fn repair(host: &mut Host, bob: CapturePoint, number: u64, fate: SampleFate, fragmented: bool) {
     host.wait(10);
-    let only_part = fate == Fate::RepairedAfterDrop;
+    let only_part = fate == SampleFate::RepairedAfterDrop;
     let again = arrival(host, bob, number, fragmented, only_part);
-    if fate == Fate::RepairDropped {
+    if fate == SampleFate::RepairDropped {
         host.put(Record {
             flags: again.flags | flag::SOCKET_FULL,
             ..arrival(host, bob, number, fragmented, true)

@@ -9,7 +9,7 @@ use ros2probe_wire::{GuidPrefix, Record};
 const DAVE: GuidPrefix = GuidPrefix(*b"\x01\x10davey-host");
 
 /// Adds a participant whose announcements of readers were missed, as by a late agent.
-fn stranger(host: &mut Host, prefix: GuidPrefix, port: u16) -> CapturePoint {
+fn unknown_participant(host: &mut Host, prefix: GuidPrefix, port: u16) -> CapturePoint {
     let address = format!("10.0.0.2:{port}").parse().unwrap();
     host.participant(prefix, address);
     CapturePoint {
@@ -55,7 +55,8 @@ fn processes_without_a_reader_in_a_multicast_group_have_no_losses() {
     for other in 1..=11 {
         // Half of the participants are known by a socket that sends; the others never sent.
         let prefix = GuidPrefix([1, 0x10, 100 + other, 4, 5, 6, 7, 8, 9, 10, 11, 12]);
-        let socket = stranger(&mut host, prefix, 7500 + u16::from(other)).multicast(other.into());
+        let socket =
+            unknown_participant(&mut host, prefix, 7500 + u16::from(other)).multicast(other.into());
         if other % 2 == 0 {
             host.owner(socket, prefix);
         }
@@ -83,7 +84,7 @@ fn counts_of_a_socket_appear_once_its_participant_is_known_as_a_reader() {
         let bob = host.reader(BOB, 7411);
         let carol = match is_reader {
             true => host.reader(CAROL, 7413),
-            false => stranger(&mut host, CAROL, 7413),
+            false => unknown_participant(&mut host, CAROL, 7413),
         };
         let (bob, carol) = (bob.multicast(101), carol.multicast(102));
         host.owner(bob, BOB);
@@ -114,8 +115,8 @@ fn samples_from_before_a_late_reader_are_neither_delivered_nor_lost() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411).multicast(101);
     host.owner(bob, BOB);
-    let carol = stranger(&mut host, CAROL, 7413).multicast(102);
-    let dave = stranger(&mut host, DAVE, 7415).multicast(103);
+    let carol = unknown_participant(&mut host, CAROL, 7413).multicast(102);
+    let dave = unknown_participant(&mut host, DAVE, 7415).multicast(103);
     host.owner(carol, CAROL);
     (1..=50).for_each(|number| send(&mut host, number, &[bob, carol, dave]));
     // Carol and Dave announce a reader; Dave's socket is found later.
@@ -142,12 +143,12 @@ fn samples_from_before_a_late_reader_are_neither_delivered_nor_lost() {
 }
 
 #[test]
-fn a_socket_of_an_unknown_participant_takes_no_sample_from_a_known_one() {
+fn a_socket_of_an_unknown_participant_receives_no_sample_of_a_known_one() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411).multicast(101);
     host.owner(bob, BOB);
     // This order occurs with the loopback of the writer's own multicast.
-    let carol = stranger(&mut host, CAROL, 7413).multicast(102);
+    let carol = unknown_participant(&mut host, CAROL, 7413).multicast(102);
     (1..=50).for_each(|number| {
         host.data(carol, number);
         host.data(bob, number);
@@ -168,7 +169,7 @@ fn a_process_is_no_longer_a_subscriber_after_its_last_reader_left() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411).multicast(101);
     host.owner(bob, BOB);
-    let carol = stranger(&mut host, CAROL, 7413).multicast(102);
+    let carol = unknown_participant(&mut host, CAROL, 7413).multicast(102);
     host.owner(carol, CAROL);
     // The agent knows only this announcement, and none before it.
     host.subscribe(CAROL, 9);
@@ -208,7 +209,9 @@ fn a_process_whose_only_reader_is_incompatible_is_not_a_subscriber() {
 #[test]
 fn a_wire_source_has_no_delivery_without_a_reader_of_the_topic() {
     let mut host = Host::new();
-    let group = stranger(&mut host, BOB, 7411).multicast(0).wire();
+    let group = unknown_participant(&mut host, BOB, 7411)
+        .multicast(0)
+        .wire();
     (1..=20).for_each(|number| send(&mut host, number, &[group]));
     assert!(host.deliveries().is_empty());
     host.subscribe(BOB, 4);
@@ -261,7 +264,7 @@ fn a_process_with_participants_in_two_domains_is_a_subscriber_in_one_domain() {
 fn losses_at_a_socket_of_an_unknown_participant_stay_bounded() {
     let mut host = Host::new();
     host.reader(BOB, 7411);
-    let stranger = stranger(&mut host, CAROL, 7413).multicast(102);
+    let stranger = unknown_participant(&mut host, CAROL, 7413).multicast(102);
     for number in (1..=1000).filter(|number| number % 2 == 0) {
         host.data(stranger, number);
     }

@@ -170,7 +170,7 @@ fn samples_of_which_bytes_were_not_captured_are_not_lost_and_later_ones_are() {
 }
 
 #[test]
-fn a_gap_of_another_connection_excuses_nothing() {
+fn a_gap_of_another_connection_marks_no_number_irrelevant() {
     let mut host = Host::new();
     let bob = best_effort(&mut host);
     for number in [1, 2, 5] {

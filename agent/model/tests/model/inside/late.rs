@@ -197,7 +197,7 @@ fn call_of_a_message() -> LateCall {
 }
 
 #[test]
-fn a_wait_is_divided_by_the_way_of_the_message() {
+fn a_wait_is_divided_by_the_hops_of_the_message() {
     let mut late = call_of_a_message();
     let expected = [
         (Stage::Publish, Cause::Send, 10),
@@ -253,7 +253,7 @@ fn a_callback_before_explains_only_the_time_since_the_message_was_received() {
 }
 
 #[test]
-fn a_stopped_process_is_named_with_who_continued_it() {
+fn a_stopped_call_has_the_thread_that_continued_the_process() {
     let mut late = call_of_a_message();
     late.delivery.as_mut().unwrap().receiver = None;
     // It was stopped before the message arrived, which is 60 ms before the call.
@@ -274,7 +274,7 @@ fn a_stopped_process_is_named_with_who_continued_it() {
 }
 
 #[test]
-fn a_callback_of_another_thread_explains_the_wait_after_the_one_of_its_own() {
+fn a_wait_is_explained_by_the_last_callback_of_any_thread() {
     let mut late = call(states(100, 0, 0, 0));
     late.wait = Some(milliseconds(80));
     late.states_before = Some(states(1, 0, 0, 59));
@@ -380,7 +380,8 @@ fn a_wait_without_a_socket_is_divided_by_the_threads_that_passed_the_message() {
     assert_eq!(&*late.named_by(main).unwrap().name, "chromium");
     let send = late.parts()[0];
     assert_eq!(&*late.named_by(send).unwrap().name, "talker");
-    // The thread received it from the network, or a process that does not publish it woke the thread.
+    // The thread received it from the network, or a process that does not publish it woke the
+    // thread.
     late.handoff.as_mut().unwrap().sender = None;
     assert_eq!(parts(&late)[0], (Stage::Wait, Cause::Arrival, 20));
     // Nor is it known when that thread was woken.
@@ -389,7 +390,7 @@ fn a_wait_without_a_socket_is_divided_by_the_threads_that_passed_the_message() {
 }
 
 #[test]
-fn a_thread_that_was_awake_before_the_message_explains_nothing_earlier() {
+fn a_thread_awake_before_the_message_does_not_explain_earlier_waits() {
     let mut late = call_of_a_handoff();
     // The middleware's thread was busy with earlier messages.
     late.wait = Some(milliseconds(45));
@@ -593,8 +594,8 @@ fn the_longest_and_the_last_calls_are_kept_after_the_process_has_ended() {
         .sum::<Duration>();
     assert_eq!(sum, history, "103 calls fit into the history");
     assert_eq!(
-        late.history.back().unwrap().culprit,
-        Some(other("chromium", 3121, 90).culprit())
+        late.history.back().unwrap().other_thread,
+        Some(other("chromium", 3121, 90).label())
     );
 }
 
@@ -621,7 +622,7 @@ fn another_thread_is_named_with_its_unit_and_an_unusual_priority() {
     assert_eq!(thread.to_string(), "chromium (3121, real-time 50)");
     thread.priority = Priority::of_kernel(120);
     assert_eq!(thread.to_string(), "chromium (3121)");
-    assert_eq!(thread.culprit().to_string(), "chromium");
+    assert_eq!(thread.label().to_string(), "chromium");
 }
 
 #[test]

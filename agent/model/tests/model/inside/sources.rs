@@ -45,7 +45,7 @@ fn counts_of_the_network_are_not_added_to_those_from_inside() {
 }
 
 #[test]
-fn without_a_datagram_the_counts_come_from_inside() {
+fn without_datagrams_calls_inside_processes_are_counted() {
     let (mut world, _) = pair(70, 70);
     for second in 1..=10 {
         let reports = report(&world, 10 * second);

@@ -69,7 +69,7 @@ fn ros_discovery_info_in_fragments_is_read() {
 }
 
 #[test]
-fn only_the_newest_node_list_from_the_participant_itself_applies() {
+fn only_the_newest_node_list_of_the_participant_applies() {
     let mut world = World::new(&[]);
     world.spdp(ALICE, 10);
     world.spdp(BOB, 10);

@@ -75,7 +75,7 @@ fn jumps_of_the_source_clock_by_years_do_not_stop_the_model() {
 }
 
 #[test]
-fn the_same_input_gives_the_same_facts() {
+fn the_same_input_yields_the_same_facts() {
     let replay = || {
         let mut world = World::new(&["/**"]);
         let mut dice = Dice(3);
@@ -122,8 +122,8 @@ fn an_agent_that_sleeps_until_the_next_decision_reports_every_event_in_time() {
             let now = world.now;
             world.observer.input(Input::Time(Timestamp(now)));
             rounds += 1;
-            let news = world.observer.drain().events.events.into_iter();
-            events.extend(news.map(|event| (event.at, format!("{:?}", event.kind), now)));
+            let new_events = world.observer.drain().events.events.into_iter();
+            events.extend(new_events.map(|event| (event.at, format!("{:?}", event.kind), now)));
         }
         (events, rounds)
     };

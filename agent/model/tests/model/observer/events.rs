@@ -134,7 +134,7 @@ fn losses_raise_one_event_per_second_even_after_their_writer_left() {
 }
 
 #[test]
-fn a_changed_state_raises_one_event_and_another_watch_raises_none() {
+fn a_changed_state_raises_one_event_and_an_unchanged_watch_no_event() {
     let expects = |pattern: &str, max_silence| Watch {
         expectations: Expectations {
             max_silence,

@@ -121,7 +121,7 @@ fn a_message_that_the_cpu_key_skipped_is_lost() {
 }
 
 #[test]
-fn a_publisher_that_changes_to_the_base_key_loses_nothing() {
+fn a_publisher_that_changes_to_the_base_key_loses_no_message() {
     let mut robot = Robot::new(&[Some(CPU), None]);
     for number in 0..20 {
         robot.put(if number < 10 { WHOLE } else { BASE }, 0);

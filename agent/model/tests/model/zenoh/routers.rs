@@ -46,7 +46,7 @@ struct Host {
 }
 
 /// Returns the direction from a socket of this host to another host, and back, both at that socket.
-fn abroad(host: u8, ports: [u16; 2], socket: u64) -> [StreamId; 2] {
+fn on_other_host(host: u8, ports: [u16; 2], socket: u64) -> [StreamId; 2] {
     let [mut there, _] = connection(ports[0]);
     there.flow.source.address[12..].copy_from_slice(&[10, 0, 0, HERE]);
     there.flow.destination.address[12..].copy_from_slice(&[10, 0, 0, host]);
@@ -68,11 +68,11 @@ fn within(ports: [u16; 2], sockets: [u64; 2]) -> [StreamId; 2] {
 }
 
 fn to_other_router() -> [StreamId; 2] {
-    abroad(THERE, [5000, 7447], 70)
+    on_other_host(THERE, [5000, 7447], 70)
 }
 
 fn to_third_router() -> [StreamId; 2] {
-    abroad(THIRD, [5001, 7447], 73)
+    on_other_host(THIRD, [5001, 7447], 73)
 }
 
 fn of_listener() -> [StreamId; 2] {

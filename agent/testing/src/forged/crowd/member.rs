@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use super::super::{
     PARTICIPANT, PUBLICATIONS_WRITER, Parameters, SPDP_WRITER, SUBSCRIPTIONS_WRITER, data, text_of,
 };
-use super::{ENTITIES_READER, ENTITIES_TYPE, ENTITIES_WRITER, LATE, STAYING, TYPE};
+use super::{ENTITIES_READER, ENTITIES_TYPE, ENTITIES_WRITER, LATE, PERMANENT_MEMBERS, TYPE};
 
 pub(super) struct Member {
     pub(super) prefix: [u8; 12],
@@ -22,7 +22,7 @@ pub(super) struct Member {
 
 impl Member {
     pub(super) fn stays(&self) -> bool {
-        self.slot < STAYING
+        self.slot < PERMANENT_MEMBERS
     }
 
     pub(super) fn is_late(&self) -> bool {

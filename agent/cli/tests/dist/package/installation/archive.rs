@@ -68,13 +68,13 @@ impl Archive {
         man.arg(self.path(page))
             .envs([("MANWIDTH", "80"), ("LC_ALL", "C.UTF-8")]);
         let output = man.output().context("man; `apt-get install man-db`")?;
-        let said = String::from_utf8_lossy(&output.stdout);
+        let printed = String::from_utf8_lossy(&output.stdout);
         let complaints = String::from_utf8_lossy(&output.stderr);
         ensure!(
             output.status.success() && complaints.is_empty(),
             "{page}: {complaints}"
         );
-        ensure!(said.contains("SYNOPSIS"), "{page}:\n{said}");
+        ensure!(printed.contains("SYNOPSIS"), "{page}:\n{printed}");
         Ok(())
     }
 

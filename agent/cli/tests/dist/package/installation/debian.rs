@@ -32,7 +32,7 @@ pub(crate) struct Debian {
 
 /// Runs a command over the fresh system in `$0`, and writes to memory. `$1` is the directory for
 /// the mounts; the command follows.
-const OVER: &str = "set -e; mkdir -p \"$1\"; mount -t tmpfs tmpfs \"$1\"; \
+const CHROOT_COMMAND: &str = "set -e; mkdir -p \"$1\"; mount -t tmpfs tmpfs \"$1\"; \
     mkdir \"$1/new\" \"$1/work\" \"$1/root\"; \
     mount -t overlay -o \"lowerdir=$0,upperdir=$1/new,workdir=$1/work\" overlay \"$1/root\"; \
     shift; exec \"$@\" </dev/null";
@@ -54,7 +54,7 @@ impl Debian {
         let cgroup = Cgroup::create(&name)?;
         let place = packages.join(&name);
         let mut words = cgroup.inside();
-        words.extend(["unshare", "--mount", "sh", "-c", OVER].map(str::to_owned));
+        words.extend(["unshare", "--mount", "sh", "-c", CHROOT_COMMAND].map(str::to_owned));
         words.push(system.display().to_string());
         words.push(place.display().to_string());
         words.extend(
@@ -104,9 +104,9 @@ impl Debian {
         self.first
     }
 
-    /// Returns the command prefix that runs a program of this machine on the host's network and in a
-    /// control group of the host. systemd-nspawn names the root of these groups `payload`.
-    pub(crate) fn beside(&self) -> Vec<String> {
+    /// Returns the command prefix that runs a program of this machine on the host's network and in
+    /// a control group of the host. systemd-nspawn names the root of these groups `payload`.
+    pub(crate) fn on_host_network(&self) -> Vec<String> {
         let enter = "mkdir -p \"$0\" && echo 0 >\"$0/cgroup.procs\" && exec \"$@\"";
         let group = self
             .cgroup
@@ -122,7 +122,7 @@ impl Debian {
 
     /// Runs a script that must succeed, and returns its output.
     pub(crate) fn run(&self, script: &str) -> Result<String> {
-        let output = self.attempt(script)?;
+        let output = self.run_script(script)?;
         ensure!(
             output.status.success(),
             "{script}: {}\n{}",
@@ -133,7 +133,7 @@ impl Debian {
     }
 
     /// Runs a script, and returns its exit status and output.
-    pub(crate) fn attempt(&self, script: &str) -> Result<Output> {
+    pub(crate) fn run_script(&self, script: &str) -> Result<Output> {
         let first = self.first.to_string();
         let mut command = Command::new("nsenter");
         command.args(["--target", &first, "--all", "env", "--ignore-environment"]);
@@ -149,7 +149,7 @@ impl Debian {
 
     /// Runs a script, and returns its output whatever its exit status.
     pub(crate) fn text(&self, script: &str) -> Result<String> {
-        Ok(all(&self.attempt(script)?))
+        Ok(all(&self.run_script(script)?))
     }
 
     /// Returns the answer of a port of the container.
@@ -170,11 +170,11 @@ impl Debian {
             let text = std::fs::read_to_string(&children)?;
             self.first = text.split_whitespace().next().map_or(Ok(0), str::parse)?;
             // A process that prepares the container precedes its first process, and soon ends.
-            let (is_up, said): (_, &[_]) = match start {
+            let (is_up, printed): (_, &[_]) = match start {
                 Start::Systemd => ("systemctl is-system-running", &["running", "degraded"]),
                 Start::Nothing => ("cat /proc/1/comm", &["(sd-stubinit)"]),
             };
-            Ok(self.first != 0 && said.contains(&self.text(is_up)?.trim()))
+            Ok(self.first != 0 && printed.contains(&self.text(is_up)?.trim()))
         })
     }
 }

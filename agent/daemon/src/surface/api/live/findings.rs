@@ -19,10 +19,10 @@ use ros2probe_model::measure::history::Past;
 use ros2probe_model::report::snapshot::{EndpointFacts, Snapshot};
 
 /// Maximum number of findings in a list.
-const MOST: usize = 512;
+const MAX_FINDINGS: usize = 512;
 
 /// Input of the findings.
-pub(super) struct Circumstances<'a> {
+pub(super) struct FindingInputs<'a> {
     pub(super) snapshot: &'a Snapshot,
     pub(super) agent: &'a AgentFacts,
     pub(super) past: &'a Past,
@@ -32,7 +32,7 @@ pub(super) struct Circumstances<'a> {
 }
 
 /// Returns all findings, the most severe first.
-pub(super) fn findings(circumstances: &Circumstances<'_>) -> Vec<Finding> {
+pub(super) fn findings(circumstances: &FindingInputs<'_>) -> Vec<Finding> {
     let mut list = of_agent(circumstances);
     list.extend(of_graph(circumstances));
     list.extend(measured::of_watches(circumstances));
@@ -40,7 +40,7 @@ pub(super) fn findings(circumstances: &Circumstances<'_>) -> Vec<Finding> {
     list.sort_by(|one, other| {
         (one.severity, &one.kind, &one.id).cmp(&(other.severity, &other.kind, &other.id))
     });
-    list.truncate(MOST);
+    list.truncate(MAX_FINDINGS);
     list
 }
 
@@ -81,7 +81,7 @@ pub(super) fn finding(
     }
 }
 
-fn of_agent(all: &Circumstances<'_>) -> Vec<Finding> {
+fn of_agent(all: &FindingInputs<'_>) -> Vec<Finding> {
     let (agent, snapshot) = (all.agent, all.snapshot);
     let mut list = Vec::new();
     if let Some(reason) = all.unready {
@@ -101,7 +101,7 @@ fn of_agent(all: &Circumstances<'_>) -> Vec<Finding> {
         let text = "Writers are active whose announcement was missed; their topics are unknown";
         let unknown = finding("unknown_writers", Severity::Warning, "", text.to_owned());
         let remedy = missed_announcements::remedy(snapshot);
-        list.push(unknown.with_remedy(remedy.unwrap_or(missed_announcements::DISCOVER)));
+        list.push(unknown.with_remedy(remedy.unwrap_or(missed_announcements::DISCOVER_COMMAND)));
     }
     if snapshot.topics_rejected > 0 {
         let text = "Watched topics are not measured: limits.topics is reached".to_owned();
@@ -146,7 +146,7 @@ fn unseen(agent: &AgentFacts) -> Vec<Finding> {
         if agent.abilities.contains(&ability) {
             continue;
         }
-        let mut blind = agent.blind.iter();
+        let mut blind = agent.missing_abilities.iter();
         let Some((_, reason)) = blind.find(|(blind, _)| *blind == ability) else {
             lacking.push(object(ability));
             continue;
@@ -192,7 +192,7 @@ pub(super) fn dropped(agent: &AgentFacts) -> u64 {
     packets + agent.records_dropped + agent.pieces_dropped
 }
 
-fn of_graph(all: &Circumstances<'_>) -> Vec<Finding> {
+fn of_graph(all: &FindingInputs<'_>) -> Vec<Finding> {
     let snapshot = all.snapshot;
     let ends = Ends::new(snapshot);
     let list = snapshot.diagnoses.list.iter();
@@ -214,7 +214,7 @@ fn of_graph(all: &Circumstances<'_>) -> Vec<Finding> {
     found.collect()
 }
 
-fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> Finding {
+fn in_words(all: &FindingInputs<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> Finding {
     let kind = diagnosis.kind();
     match diagnosis {
         Diagnosis::QosIncompatible {
@@ -260,7 +260,7 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
             reason,
         } => Finding {
             writer: Some(writer.to_string()),
-            ..unmatched(kind, topic, *writer, reason.label(), ends, PUBLISHER)
+            ..unmatched(kind, topic, *writer, reason.label(), ends, PUBLISHER_WORDS)
         },
         Diagnosis::UnmatchedSubscription {
             topic,
@@ -268,12 +268,12 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
             reason,
         } => Finding {
             reader: Some(reader.to_string()),
-            ..unmatched(kind, topic, *reader, reason.label(), ends, SUBSCRIBER)
+            ..unmatched(kind, topic, *reader, reason.label(), ends, SUBSCRIBER_WORDS)
         },
         Diagnosis::HangingCall { topic, writer } => {
             let text = format!(
                 "{} calls {} and receives no reply",
-                ends.who(*writer),
+                ends.owner_name(*writer),
                 topic.name
             );
             let about = format!("{}|{}|{writer}", topic.domain_id, topic.dds_name);
@@ -318,12 +318,12 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
             backends,
         } => {
             let why = match reader {
-                Some(reader) => format!("{} takes no buffers", ends.who(*reader)),
+                Some(reader) => format!("{} takes no buffers", ends.owner_name(*reader)),
                 None => "it is transient local".to_owned(),
             };
             let text = format!(
                 "{} sends {} through the CPU instead of {}: {why}",
-                ends.who(*writer),
+                ends.owner_name(*writer),
                 topic.name,
                 backends.join(", ")
             );
@@ -365,7 +365,10 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
             domain_id,
             participants,
         } => {
-            let listed: Vec<_> = participants.iter().map(|guid| ends.who(*guid)).collect();
+            let listed: Vec<_> = participants
+                .iter()
+                .map(|guid| ends.owner_name(*guid))
+                .collect();
             let text = format!(
                 "Participants with different addresses have one machine id, so they use only shared \
                  memory with each other: {}",
@@ -399,8 +402,8 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
 }
 
 /// Role of an endpoint, and its counterpart.
-const PUBLISHER: [&str; 2] = ["publishes", "subscription"];
-const SUBSCRIBER: [&str; 2] = ["subscribes to", "publisher"];
+const PUBLISHER_WORDS: [&str; 2] = ["publishes", "subscription"];
+const SUBSCRIBER_WORDS: [&str; 2] = ["subscribes to", "publisher"];
 
 /// Describes an endpoint without a counterpart.
 fn unmatched(
@@ -411,10 +414,13 @@ fn unmatched(
     ends: &Ends<'_>,
     [verb, counterpart]: [&str; 2],
 ) -> Finding {
-    let (who, why) = (ends.who(endpoint), lacks(reason, counterpart));
-    let text = format!("{who} {verb} {}, and {why}", topic.name);
+    let (owner, why) = (
+        ends.owner_name(endpoint),
+        missing_counterpart(reason, counterpart),
+    );
+    let text = format!("{owner} {verb} {}, and {why}", topic.name);
     let about = format!("{}|{}|{endpoint}", topic.domain_id, topic.dds_name);
-    let found = finding(kind, alone(reason), &about, text);
+    let found = finding(kind, severity_of_unmatched(reason), &about, text);
     match reason {
         "unreachable" => found.with_remedy(
             "on the host with 127.0.0.1, unset ROS_LOCALHOST_ONLY, or set ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET",
@@ -437,8 +443,8 @@ fn incompatible(
         .collect();
     let text = format!(
         "{} sends nothing to {} on {}: {}",
-        ends.who(writer),
-        ends.who(reader),
+        ends.owner_name(writer),
+        ends.owner_name(reader),
         topic.name,
         differ.join("; ")
     );
@@ -453,7 +459,7 @@ fn incompatible(
 }
 
 /// Returns why an endpoint has no counterpart.
-fn lacks(reason: &str, counterpart: &str) -> String {
+fn missing_counterpart(reason: &str, counterpart: &str) -> String {
     match reason {
         "unreachable" => format!(
             "every {counterpart} is on another host, and one of the two announces only 127.0.0.1"
@@ -467,7 +473,7 @@ fn lacks(reason: &str, counterpart: &str) -> String {
 
 /// Returns the severity. An endpoint without any counterpart is common, but an endpoint with only
 /// incompatible counterparts is not.
-fn alone(reason: &str) -> Severity {
+fn severity_of_unmatched(reason: &str) -> Severity {
     match reason {
         "unreachable" | "qos" | "type" | "partition" => Severity::Warning,
         _ => Severity::Note,
@@ -503,9 +509,9 @@ impl<'a> Ends<'a> {
         }
     }
 
-    /// Returns the node of an endpoint. If no node announces it, those of its participant are named.
-    /// Without these, it is the GUID.
-    fn who(&self, guid: Guid) -> String {
+    /// Returns the node of an endpoint. If no node announces it, those of its participant are
+    /// named. Without these, it is the GUID.
+    fn owner_name(&self, guid: Guid) -> String {
         let endpoint = self.endpoints.get(&guid);
         if let Some(node) = endpoint.and_then(|endpoint| endpoint.node.as_ref()) {
             return node.to_string();
@@ -568,7 +574,7 @@ mod tests {
 
     #[test]
     fn findings_beyond_the_cap_are_dropped_and_the_most_severe_stay() {
-        let list = (0..2 * MOST).map(|number| Diagnosis::DuplicateNode {
+        let list = (0..2 * MAX_FINDINGS).map(|number| Diagnosis::DuplicateNode {
             domain_id: DomainId(0),
             node: format!("/node_{number}").into(),
             participants: Vec::new(),
@@ -580,14 +586,14 @@ mod tests {
             }),
             ..Snapshot::default()
         };
-        let found = findings(&Circumstances {
+        let found = findings(&FindingInputs {
             snapshot: &snapshot,
             agent: &AgentFacts::new(SourceKind::Wire, Instant::now()),
             past: &Past::default(),
             ids: &Ids::default(),
             unready: Some("no packet was seen"),
         });
-        assert_eq!(found.len(), MOST);
+        assert_eq!(found.len(), MAX_FINDINGS);
         let first = found.first().unwrap();
         assert_eq!(
             (&*first.kind, first.severity),
@@ -619,14 +625,14 @@ mod tests {
             }),
             ..Snapshot::default()
         };
-        let who = |snapshot: &Snapshot| Ends::new(snapshot).who(reader);
-        assert_eq!(who(&snapshot), "the participant of /lidar");
+        let owner = |snapshot: &Snapshot| Ends::new(snapshot).owner_name(reader);
+        assert_eq!(owner(&snapshot), "the participant of /lidar");
         snapshot.nodes.push(node("/imu"));
-        assert_eq!(who(&snapshot), "the participant of /lidar and /imu");
+        assert_eq!(owner(&snapshot), "the participant of /lidar and /imu");
         snapshot.nodes.push(node("/base"));
-        assert_eq!(who(&snapshot), "the participant of /lidar and 2 others");
+        assert_eq!(owner(&snapshot), "the participant of /lidar and 2 others");
         snapshot.nodes.clear();
-        assert_eq!(who(&snapshot), reader.to_string());
+        assert_eq!(owner(&snapshot), reader.to_string());
     }
 
     #[test]
@@ -688,7 +694,9 @@ mod tests {
             "{lacking:?}"
         );
         let reason = "the kernel is too old".to_owned();
-        agent.blind.push((Ability::SocketLosses, reason));
+        agent
+            .missing_abilities
+            .push((Ability::SocketLosses, reason));
         let both = text(&agent);
         assert_eq!(
             both[0],

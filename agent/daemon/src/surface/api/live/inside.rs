@@ -26,12 +26,12 @@ pub(super) fn in_words(ids: &Ids, diagnosis: &Diagnosis) -> Finding {
             };
             let text = format!(
                 "The callback of {trigger} in {} takes {}; {which} {}",
-                who(callback),
+                owner_name(callback),
                 milliseconds(*duration),
                 milliseconds(*period)
             );
             let remedy = "shorten the callback, or give it a callback group and thread of its own";
-            (about(callback), text, remedy)
+            (owner_object(callback), text, remedy)
         }
         Diagnosis::ExecutorWait {
             callback,
@@ -41,11 +41,11 @@ pub(super) fn in_words(ids: &Ids, diagnosis: &Diagnosis) -> Finding {
         } => {
             let text = format!(
                 "The callback of {trigger} in {} waits {} for the executor",
-                who(callback),
+                owner_name(callback),
                 milliseconds(*wait)
             );
             let remedy = "shorten the callbacks of its thread, or use a multi-threaded executor";
-            (about(callback), text, remedy)
+            (owner_object(callback), text, remedy)
         }
         Diagnosis::LateCallback {
             callback,
@@ -58,11 +58,11 @@ pub(super) fn in_words(ids: &Ids, diagnosis: &Diagnosis) -> Finding {
         } => {
             let text = format!(
                 "The callback of {trigger} in {} was late {calls} times in a minute, up to {}: {}",
-                who(callback),
+                owner_name(callback),
                 milliseconds(*longest),
                 cause.in_words(by.as_ref().map(|by| by as _))
             );
-            (about(callback), text, cause.remedy())
+            (owner_object(callback), text, cause.remedy())
         }
         Diagnosis::IntraProcessOverflow {
             topic,
@@ -72,12 +72,12 @@ pub(super) fn in_words(ids: &Ids, diagnosis: &Diagnosis) -> Finding {
             let text = format!(
                 "The queue of {} within {} overwrote {}.{} % of the messages",
                 topic.name,
-                who(queue),
+                owner_name(queue),
                 overwritten_permille / 10,
                 overwritten_permille % 10
             );
             let remedy = "raise the depth of the subscription, or shorten its callback";
-            (about(queue), text, remedy)
+            (owner_object(queue), text, remedy)
         }
         Diagnosis::ReaderQueueOverflow {
             topic,
@@ -88,7 +88,7 @@ pub(super) fn in_words(ids: &Ids, diagnosis: &Diagnosis) -> Finding {
             let depth = depth.map(|depth| format!(" of depth {depth}"));
             let text = format!(
                 "{} takes {} too slowly: its queue{} loses {}.{} % of the messages",
-                who(queue),
+                owner_name(queue),
                 topic.name,
                 depth.unwrap_or_default(),
                 lost_permille / 10,
@@ -96,7 +96,7 @@ pub(super) fn in_words(ids: &Ids, diagnosis: &Diagnosis) -> Finding {
             );
             let remedy = "shorten the callback, give it a callback group and thread of its own, or \
                           raise the depth of the subscription";
-            (about(queue), text, remedy)
+            (owner_object(queue), text, remedy)
         }
         Diagnosis::ObservationSuspended { process, name, .. } => {
             let name = name.as_deref().unwrap_or("a process");
@@ -116,13 +116,13 @@ pub(super) fn in_words(ids: &Ids, diagnosis: &Diagnosis) -> Finding {
     .with_remedy(remedy)
 }
 
-fn who(owner: &Owner) -> String {
+fn owner_name(owner: &Owner) -> String {
     let process = || format!("process {}", owner.process);
     let node = owner.node.as_ref().map(ToString::to_string);
     node.unwrap_or_else(process)
 }
 
-fn about(owner: &Owner) -> String {
+fn owner_object(owner: &Owner) -> String {
     format!("{}|{:x}", owner.process, owner.handle)
 }
 

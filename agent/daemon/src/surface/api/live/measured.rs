@@ -1,11 +1,11 @@
-//! Findings about measured topics: expectations of watches, and losses. The texts contain limits and
-//! names, but no measured numbers: those change each second, and the page has them.
+//! Findings about measured topics: expectations of watches, and losses. The texts contain limits
+//! and names, but no measured numbers: those change each second, and the page has them.
 
 use std::cmp::Reverse;
 
 use super::super::watch::expectations;
-use super::findings::{Circumstances, finding};
-use super::values::{LOSS, lost_lately};
+use super::findings::{FindingInputs, finding};
+use super::values::{LOSS_FLAG_SECONDS, recent_losses};
 use ros2probe_api::live::{Finding, Severity};
 use ros2probe_model::facts::names::NodeName;
 use ros2probe_model::facts::route::Direction;
@@ -13,7 +13,7 @@ use ros2probe_model::measure::history::Past;
 use ros2probe_model::report::snapshot::{TopicFacts, WatchState};
 
 /// Returns a finding for each violated expectation of a watch.
-pub(super) fn of_watches(all: &Circumstances<'_>) -> Vec<Finding> {
+pub(super) fn of_watches(all: &FindingInputs<'_>) -> Vec<Finding> {
     let mut list = Vec::new();
     for watch in &all.snapshot.watches {
         for topic in &watch.topics {
@@ -52,13 +52,13 @@ pub(super) fn of_watches(all: &Circumstances<'_>) -> Vec<Finding> {
 }
 
 /// Returns a finding with the cause for each topic that lost messages recently.
-pub(super) fn losses(all: &Circumstances<'_>) -> Vec<Finding> {
-    let lost = lost_lately(all.past);
+pub(super) fn losses(all: &FindingInputs<'_>) -> Vec<Finding> {
+    let lost = recent_losses(all.past);
     let topics = all.snapshot.topics.iter();
     let found = topics.filter_map(|topic| {
         let known = all.past.id(topic.domain_id, &topic.dds_name)?;
         lost.get(&known)?;
-        let (place, remedy) = died(topic);
+        let (place, remedy) = main_loss_cause(topic);
         let receiver = worst_receiver(topic).map_or_else(String::new, |name| format!(" to {name}"));
         let text = format!("{} loses messages{receiver}{place}", topic.name);
         let about = format!("{}|{}", topic.domain_id, topic.dds_name);
@@ -88,7 +88,7 @@ fn worst_receiver(topic: &TopicFacts) -> Option<String> {
 }
 
 /// Returns where most of a topic's messages were lost, if known, and the remedy.
-fn died(topic: &TopicFacts) -> (&'static str, &'static str) {
+fn main_loss_cause(topic: &TopicFacts) -> (&'static str, &'static str) {
     let received = topic.received.as_deref();
     let at = received.map_or([0; 4], |received| {
         [
@@ -128,8 +128,8 @@ fn died(topic: &TopicFacts) -> (&'static str, &'static str) {
     }
 }
 
-/// Returns when the current loss began. Pauses of up to [`LOSS`] seconds do not end a loss. Returns
-/// `None` without a recent loss.
+/// Returns when the current loss began. Pauses of up to [`LOSS_FLAG_SECONDS`] seconds do not end a
+/// loss. Returns `None` without a recent loss.
 fn began(past: &Past, topic: u32) -> Option<f64> {
     let mut began = None;
     let mut pause = 0;
@@ -139,7 +139,7 @@ fn began(past: &Past, topic: u32) -> Option<f64> {
         } else {
             pause += 1;
         }
-        if pause > LOSS {
+        if pause > LOSS_FLAG_SECONDS {
             break;
         }
     }

@@ -28,9 +28,9 @@ use utoipa_axum::routes;
 use super::Context;
 use super::body_stream::{Pieces, lines_of, stream_of, write_line};
 use super::events::event;
-use super::health::HOST;
+use super::health::HOST_NAME;
 use super::problem::{Code, Problem, ProblemBody};
-use super::security::Granted;
+use super::security::Rights;
 use crate::agent_facts::SourceKind;
 use crate::events::Reader;
 use crate::snapshot_cell::State as Known;
@@ -43,11 +43,11 @@ use shared_lines::SharedLines;
 /// that other requests still get a connection.
 const MAX_TABS: usize = 16;
 /// Time between two batches; the agent publishes its state once per second.
-const INTERVAL: Duration = Duration::from_secs(1);
+const BATCH_INTERVAL: Duration = Duration::from_secs(1);
 /// The stream begins to wait for the next state this long before it is due.
-const EARLY: Duration = Duration::from_millis(100);
+const EARLY_WAIT: Duration = Duration::from_millis(100);
 /// Maximum number of events in one batch.
-const EVENTS: usize = 64;
+const MAX_EVENTS: usize = 64;
 
 /// State that all streams share. The shared lines exist only while a stream is open.
 #[derive(Debug)]
@@ -63,7 +63,7 @@ struct Stream {
     context: Context,
     access: String,
     /// The round of the last state that was sent; `None` before the first state.
-    seen: Option<u64>,
+    last_sent_round: Option<u64>,
     sent: Instant,
     /// Number of the last event that was processed.
     place: u64,
@@ -110,16 +110,16 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
 )]
 async fn live(
     State(context): State<Context>,
-    Extension(granted): Extension<Granted>,
+    Extension(granted): Extension<Rights>,
 ) -> Result<Response, Problem> {
-    let permit = context.live.places.take(granted.is_holder());
+    let permit = context.live.places.take(granted.has_token());
     let permit = permit.ok_or_else(|| {
         let detail = format!("{MAX_TABS} pages are open, which is the limit");
         Problem::new(Code::TooManyStreams, detail)
     })?;
     let stream = Stream {
         access: granted.access().to_string(),
-        seen: None,
+        last_sent_round: None,
         sent: Instant::now(),
         place: context.events.last(),
         ended: false,
@@ -131,10 +131,10 @@ async fn live(
 
 /// Returns the lines that describe the whole state, as at the beginning of a stream, without rates
 /// of earlier minutes and events.
-pub(super) fn whole_state(context: &Context) -> Vec<u8> {
+pub(super) fn initial_lines(context: &Context) -> Vec<u8> {
     let (state, past) = (context.latest.state(), context.latest.past());
     let mut shared = SharedLines::default();
-    shared.update(&state, &past, &context.watches.in_force());
+    shared.update(&state, &past, &context.watches.active());
     let mut lines = Vec::new();
     write_line(
         &mut lines,
@@ -154,14 +154,14 @@ fn open(context: &Context, state: &Known, access: String) -> Open {
     });
     Open {
         run: context.events.run(),
-        host: HOST.clone(),
+        host: HOST_NAME.clone(),
         version: env!("CARGO_PKG_VERSION").into(),
         source: state.agent.source.label().into(),
         access,
         interval_seconds: 1,
         history_seconds: context.live.history.as_secs(),
         keeps_history: context.disk_history.is_kept(),
-        flags: values::FLAGS.map(Into::into).into(),
+        flags: values::FLAG_MEANINGS.map(Into::into).into(),
         passages: Transport::ALL.map(|each| each.label().into()).into(),
         replay,
     }
@@ -176,9 +176,9 @@ impl Pieces for Stream {
             return None;
         }
         let mut lines = Vec::new();
-        if self.seen.is_none() {
+        if self.last_sent_round.is_none() {
             self.context.state().await;
-        } else if !self.moment().await {
+        } else if !self.wait_next_state().await {
             self.ended = true;
             let reason = "the agent ends".into();
             write_line(&mut lines, &Line::End(End { reason }));
@@ -192,14 +192,14 @@ impl Pieces for Stream {
 
 impl Stream {
     /// Waits for the next state. Returns `false` if the agent stops.
-    async fn moment(&self) -> bool {
+    async fn wait_next_state(&self) -> bool {
         let latest = &self.context.latest;
         let next = async {
-            sleep_until(self.sent + INTERVAL - EARLY).await;
+            sleep_until(self.sent + BATCH_INTERVAL - EARLY_WAIT).await;
             tokio::select! {
                 () = latest.published() => {}
                 // A finished capture publishes no further state.
-                () = sleep_until(self.sent + INTERVAL + EARLY * 3) => {}
+                () = sleep_until(self.sent + BATCH_INTERVAL + EARLY_WAIT * 3) => {}
             }
         };
         tokio::select! {
@@ -213,24 +213,24 @@ impl Stream {
         let (state, past) = (context.latest.state(), context.latest.past());
         let mut shared = context.live.shared();
         let shared = shared.get_or_insert_default();
-        shared.update(&state, &past, &context.watches.in_force());
-        let seen = self.seen.unwrap_or(0);
-        if self.seen.is_none() {
+        shared.update(&state, &past, &context.watches.active());
+        let seen = self.last_sent_round.unwrap_or(0);
+        if self.last_sent_round.is_none() {
             let open = open(context, &state, self.access.clone());
             write_line(lines, &Line::Open(open));
         }
         for part in shared.parts(seen) {
             lines.extend_from_slice(part);
         }
-        if self.seen.is_none() {
+        if self.last_sent_round.is_none() {
             let history = values::history(state.known(), &past, &shared.ids);
             write_line(lines, &Line::History(history));
         }
         let log = &context.events;
-        let batch = log.read(self.place, EVENTS);
+        let batch = log.read(self.place, MAX_EVENTS);
         self.place = batch.last;
         if batch.lagged > 0 || !batch.records.is_empty() {
-            log.overtook(Reader::Stream, batch.lagged);
+            log.count_overwritten(Reader::Stream, batch.lagged);
             let events = Events {
                 missed: batch.lagged,
                 list: batch
@@ -242,7 +242,7 @@ impl Stream {
             write_line(lines, &Line::Events(events));
         }
         write_line(lines, &Line::Values(shared.values(seen)));
-        self.seen = Some(shared.round());
+        self.last_sent_round = Some(shared.round());
     }
 }
 

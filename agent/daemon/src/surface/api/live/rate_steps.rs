@@ -6,9 +6,9 @@ use super::super::history::thousandths;
 use ros2probe_api::live::{History, Rates};
 
 /// Length of a step, in seconds.
-pub(in super::super) const STEP: u32 = 10;
+pub(in super::super) const STEP_SECONDS: u32 = 10;
 /// Maximum number of steps.
-pub(in super::super) const STEPS: u32 = 60;
+pub(in super::super) const MAX_STEPS: u32 = 60;
 
 /// Sums of each step: of all topics together, and the messages and seconds of each topic.
 #[derive(Debug)]
@@ -78,7 +78,7 @@ impl RateSteps {
             Rates(topic, steps.collect())
         });
         History {
-            step_seconds: STEP,
+            step_seconds: STEP_SECONDS,
             t: times,
             totals: [messages, bytes, lost],
             topics: topics.collect(),

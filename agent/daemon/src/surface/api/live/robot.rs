@@ -20,8 +20,8 @@ pub(super) fn in_words(ids: &Ids, diagnosis: &Diagnosis) -> Finding {
             errors,
             text,
         } => {
-            let said = format!("{node} logged {errors} errors within a minute: {text}");
-            let found = of_node(kind, ids, (*domain_id, node), said);
+            let sentence = format!("{node} logged {errors} errors within a minute: {text}");
+            let found = of_node(kind, ids, (*domain_id, node), sentence);
             found.with_remedy(format!("`rp log {node} --level error` prints them"))
         }
         Diagnosis::DiagnosticError {
@@ -130,14 +130,14 @@ pub(super) fn in_words(ids: &Ids, diagnosis: &Diagnosis) -> Finding {
 
 /// Returns what is wrong with shared memory.
 fn memory_fault(kind: &'static str, fault: MemoryFault, figure: u64) -> Finding {
-    const CLEAN: &str = "`fastdds shm clean` removes what ended nodes left";
+    const SHM_CLEAN_REMEDY: &str = "`fastdds shm clean` removes what ended nodes left";
     let (severity, text, remedy) = match fault {
         MemoryFault::Full => (
             Severity::Warning,
             "/dev/shm, of this host or of a container, is nearly full: Fast DDS then sends over the \
              network, or nodes fail at start"
                 .to_owned(),
-            format!("df -h /dev/shm; {CLEAN}"),
+            format!("df -h /dev/shm; {SHM_CLEAN_REMEDY}"),
         ),
         MemoryFault::Stale => (
             Severity::Warning,
@@ -145,7 +145,7 @@ fn memory_fault(kind: &'static str, fault: MemoryFault, figure: u64) -> Finding 
                 "files of ended nodes take {} MB of /dev/shm: nodes that are killed leave them",
                 figure >> 20
             ),
-            CLEAN.to_owned(),
+            SHM_CLEAN_REMEDY.to_owned(),
         ),
         MemoryFault::Split => (
             Severity::Error,
@@ -316,7 +316,7 @@ mod tests {
     }
 
     #[test]
-    fn the_findings_say_what_is_wrong_and_what_helps() {
+    fn findings_have_a_sentence_and_a_remedy() {
         let near = |subscription: TopicKey, difference| Diagnosis::NearMiss {
             topic: topic(0, "/scan"),
             subscription,

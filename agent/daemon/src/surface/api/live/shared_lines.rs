@@ -9,13 +9,13 @@ use bytes::Bytes;
 
 use super::super::body_stream::write_line;
 use super::super::index::Index;
-use super::findings::{Circumstances, dropped, findings};
+use super::findings::{FindingInputs, dropped, findings};
 use super::structure::Ids;
-use super::values::{Figures, lost_lately, totals};
+use super::values::{Figures, recent_losses, totals};
 use crate::agent_facts::Ability as Able;
 use crate::agent_facts::SourceKind;
 use crate::snapshot_cell::State;
-use crate::watches::InForce;
+use crate::watches::ActiveWatches;
 use ros2probe_api::live::{Ability, Agent, Graph, Line, Progress, Row, Totals, Values};
 use ros2probe_model::measure::history::Past;
 use ros2probe_model::report::snapshot::Snapshot;
@@ -27,7 +27,7 @@ pub(super) struct SharedLines {
     round: u64,
     state: Option<Arc<State>>,
     past: Option<Arc<Past>>,
-    in_force: Option<Arc<InForce>>,
+    in_force: Option<Arc<ActiveWatches>>,
     pub(super) ids: Ids,
     structure: Part,
     agent: Part,
@@ -57,7 +57,12 @@ impl Part {
 
 impl SharedLines {
     /// Updates the lines to a new state; does nothing if the state is the current one.
-    pub(super) fn update(&mut self, state: &Arc<State>, past: &Arc<Past>, in_force: &Arc<InForce>) {
+    pub(super) fn update(
+        &mut self,
+        state: &Arc<State>,
+        past: &Arc<Past>,
+        in_force: &Arc<ActiveWatches>,
+    ) {
         let is_same = self
             .state
             .as_ref()
@@ -80,8 +85,8 @@ impl SharedLines {
             index: &index,
             past,
             watchlist: in_force.watchlist(),
-            sees_memory: state.agent.shared_memory.is_some(),
-            lost: lost_lately(past),
+            observes_shared_memory: state.agent.shared_memory.is_some(),
+            lost: recent_losses(past),
         };
         self.update_rows(figures.rows(&self.ids));
         self.at = snapshot.time().seconds();
@@ -92,7 +97,7 @@ impl SharedLines {
             Progress(
                 agent.replayed,
                 agent.finished.into(),
-                pace.is_still().into(),
+                pace.is_paused().into(),
                 pace.times(agent.replay_speed),
             )
         });
@@ -106,7 +111,7 @@ impl SharedLines {
         &mut self,
         snapshot: &'a Snapshot,
         index: &Index<'a>,
-        in_force: &InForce,
+        in_force: &ActiveWatches,
     ) {
         let round = self.round;
         let version = self.structure.changed;
@@ -123,12 +128,15 @@ impl SharedLines {
     }
 
     /// Updates the lines of the agent and of the findings.
-    fn update_agent(&mut self, state: &State, past: &Past, in_force: &InForce) {
+    fn update_agent(&mut self, state: &State, past: &Past, in_force: &ActiveWatches) {
         let (snapshot, agent, round) = (state.known(), &state.agent, self.round);
         let unready = state.ready(Instant::now()).err();
         let unready = unready.map(|reason| reason.to_string());
         let abilities = Able::ALL.iter().map(|ability| {
-            let reason = agent.blind.iter().find(|(blind, _)| blind == ability);
+            let reason = agent
+                .missing_abilities
+                .iter()
+                .find(|(blind, _)| blind == ability);
             Ability(
                 ability.label().into(),
                 agent.abilities.contains(ability).into(),
@@ -146,7 +154,7 @@ impl SharedLines {
             watches: in_force.entries().len(),
         });
         self.agent.set(&line, round);
-        let list = findings(&Circumstances {
+        let list = findings(&FindingInputs {
             snapshot,
             agent,
             past,

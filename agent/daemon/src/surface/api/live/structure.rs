@@ -8,7 +8,7 @@ use ros2probe_wire::{DomainId, EntityId, Guid};
 
 use super::super::endpoint::{texts, vendor};
 use super::super::index::Index;
-use crate::watches::{InForce, Origin};
+use crate::watches::{ActiveWatches, Origin};
 use ros2probe_api::live::{Endpoint, Graph, Node, Participant, Topic};
 use ros2probe_model::facts::topic_kind::TopicKind;
 use ros2probe_model::report::snapshot::{EndpointFacts, Snapshot, TopicFacts};
@@ -80,7 +80,7 @@ impl Ids {
         &mut self,
         snapshot: &'a Snapshot,
         index: &Index<'a>,
-        in_force: &InForce,
+        in_force: &ActiveWatches,
         round: u64,
     ) -> Graph<'a> {
         let mut graph = Graph::default();
@@ -184,7 +184,7 @@ pub(super) fn is_measured<'a>(topic: &'a TopicFacts, index: &Index<'a>) -> bool 
 }
 
 /// Returns the origins of the topic's watches, encoded as in [`Topic`].
-fn watched<'a>(topic: &'a TopicFacts, index: &Index<'a>, in_force: &InForce) -> u8 {
+fn watched<'a>(topic: &'a TopicFacts, index: &Index<'a>, in_force: &ActiveWatches) -> u8 {
     let (mut own, mut glob) = (0, 0);
     for (watch, _) in index.watches(topic) {
         if *watch.watch.pattern != *topic.name {

@@ -2,9 +2,9 @@
 
 use std::collections::{BTreeMap, HashMap};
 
-use super::super::history::{short, thousandths};
+use super::super::history::{stored_precision, thousandths};
 use super::super::index::Index;
-use super::rate_steps::{Part, RateSteps, STEP, STEPS};
+use super::rate_steps::{MAX_STEPS, Part, RateSteps, STEP_SECONDS};
 use super::structure::{Ids, is_measured, is_shown};
 use crate::config::Watchlist;
 use ros2probe_api::live::{History, Row, Totals};
@@ -13,10 +13,10 @@ use ros2probe_model::measure::history::{Past, Second};
 use ros2probe_model::report::snapshot::{Snapshot, TopicFacts, Transport, WatchState};
 
 /// Time for which a loss is flagged, in seconds.
-pub(super) const LOSS: usize = 60;
+pub(super) const LOSS_FLAG_SECONDS: usize = 60;
 
 /// Meaning of a topic's flags, starting with the lowest bit.
-pub(super) const FLAGS: [&str; 12] = [
+pub(super) const FLAG_MEANINGS: [&str; 12] = [
     "qos",
     "type",
     "definition",
@@ -31,7 +31,7 @@ pub(super) const FLAGS: [&str; 12] = [
     "rejected",
 ];
 
-/// A flag, by its index in [`FLAGS`].
+/// A flag, by its index in [`FLAG_MEANINGS`].
 #[derive(Clone, Copy)]
 enum Flag {
     Qos,
@@ -55,8 +55,8 @@ pub(super) struct Figures<'a> {
     pub(super) past: &'a Past,
     pub(super) watchlist: &'a Watchlist,
     /// Whether messages in shared memory are observed.
-    pub(super) sees_memory: bool,
-    /// Messages lost in the last [`LOSS`] seconds, by the topic's id in the history.
+    pub(super) observes_shared_memory: bool,
+    /// Messages lost in the last [`LOSS_FLAG_SECONDS`] seconds, by the topic's id in the history.
     pub(super) lost: HashMap<u32, u32>,
 }
 
@@ -83,7 +83,11 @@ impl Figures<'_> {
         };
         let second = known.and_then(|known| last?.row(known));
         let latency = second.and_then(|second| second.latency());
-        let part = |place: usize| latency.and_then(|it| it.get(place).copied()).map(short);
+        let part = |place: usize| {
+            latency
+                .and_then(|it| it.get(place).copied())
+                .map(stored_precision)
+        };
         let at = measured.last_message;
         Row(
             id,
@@ -155,7 +159,7 @@ impl Figures<'_> {
         mark(Flag::Loss, lost.is_some_and(|lost| *lost > 0));
         let is_unseen = |passage| match passage {
             Transport::Network | Transport::Tcp => false,
-            Transport::SharedMemory => !self.sees_memory,
+            Transport::SharedMemory => !self.observes_shared_memory,
             Transport::DataSharing | Transport::SameProcess | Transport::Iceoryx => true,
         };
         let mut transports = topic.transports.iter();
@@ -210,9 +214,9 @@ pub(super) fn totals(snapshot: &Snapshot, past: &Past) -> Totals {
 }
 
 /// Returns the recently lost messages, by the topic's id in the history.
-pub(super) fn lost_lately(past: &Past) -> HashMap<u32, u32> {
+pub(super) fn recent_losses(past: &Past) -> HashMap<u32, u32> {
     let seconds = past.seconds();
-    let first = seconds.len().saturating_sub(LOSS);
+    let first = seconds.len().saturating_sub(LOSS_FLAG_SECONDS);
     let mut lost = HashMap::new();
     for second in seconds.get(first..).unwrap_or_default() {
         for row in second.rows().iter().filter(|row| row.lost > 0) {
@@ -226,9 +230,11 @@ pub(super) fn lost_lately(past: &Past) -> HashMap<u32, u32> {
 /// Returns the rates of the last minutes for measured topics.
 pub(super) fn history(snapshot: &Snapshot, past: &Past, ids: &Ids) -> History {
     let seconds = past.seconds();
-    let first = seconds.len().saturating_sub((STEP * STEPS) as usize);
+    let first = seconds
+        .len()
+        .saturating_sub((STEP_SECONDS * MAX_STEPS) as usize);
     let steps = seconds.get(first..).unwrap_or_default();
-    let steps = steps.chunks(STEP as usize);
+    let steps = steps.chunks(STEP_SECONDS as usize);
     let topics = snapshot.topics.iter().filter_map(|topic| {
         let known = past.id(topic.domain_id, &topic.dds_name)?;
         Some((known, ids.topic(topic.domain_id, &topic.dds_name)?))
@@ -258,11 +264,11 @@ mod tests {
 
     #[test]
     fn every_flag_has_its_name() {
-        let named = |flag: Flag| FLAGS[flag as usize];
+        let named = |flag: Flag| FLAG_MEANINGS[flag as usize];
         assert_eq!(named(Flag::Qos), "qos");
         assert_eq!(named(Flag::Silent), "silent");
         assert_eq!(named(Flag::Loss), "loss");
         assert_eq!(named(Flag::Rejected), "rejected");
-        assert_eq!(Flag::Rejected as usize + 1, FLAGS.len());
+        assert_eq!(Flag::Rejected as usize + 1, FLAG_MEANINGS.len());
     }
 }

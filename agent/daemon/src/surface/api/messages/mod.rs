@@ -25,7 +25,7 @@ use utoipa::{IntoParams, ToSchema};
 use super::body_stream::{Pieces, lines_of, stream_of, write_line};
 use super::problem::{Code, Problem, ProblemBody};
 use super::scope::Domain;
-use super::security::Granted;
+use super::security::Rights;
 use super::topics::{TopicParameter, find};
 use super::{Context, Streamed};
 use crate::config::Access;
@@ -38,19 +38,19 @@ use ros2probe_model::facts::names::{DdsName, TypeName};
 use ros2probe_model::report::snapshot::EndpointFacts;
 use ros2probe_wire::DomainId;
 use ros2probe_wire::discovery::{EquivalenceHash, TypeHash};
-use tree::{ELEMENTS, Tree};
+use tree::{MAX_ELEMENTS, Tree};
 
 /// Slots for streams of all listeners. Each stream makes the agent capture all payloads of its
 /// topic.
-static STREAMS: Semaphore = Semaphore::const_new(MAX_READERS);
+static STREAM_PERMITS: Semaphore = Semaphore::const_new(MAX_READERS);
 const MAX_READERS: usize = 8;
 /// Default and maximum rate of shown messages, in hertz.
-const MOST_HERTZ: f64 = 5.0;
-const LEAST_HERTZ: f64 = 0.1;
+const MAX_HERTZ: f64 = 5.0;
+const MIN_HERTZ: f64 = 0.1;
 /// Maximum size of messages that wait while one is shown, in bytes.
 const QUEUE_BYTES: usize = 16 << 20;
 /// Maximum time without a line.
-const BEAT: Duration = Duration::from_secs(1);
+const HEARTBEAT_INTERVAL: Duration = Duration::from_secs(1);
 
 #[derive(Clone, Copy, Debug, Default, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields, default)]
@@ -168,19 +168,19 @@ pub(super) async fn definition(
 )]
 pub(super) async fn follow(
     context: Context,
-    granted: &Granted,
+    granted: &Rights,
     name: &str,
     wanted: Wanted,
 ) -> Result<Response, Problem> {
     granted.require(Access::All)?;
-    let hertz = wanted.max_hertz.unwrap_or(MOST_HERTZ);
-    if !(LEAST_HERTZ..=MOST_HERTZ).contains(&hertz) {
-        let detail = format!("max_hertz is {hertz}, must be {LEAST_HERTZ} to {MOST_HERTZ}");
+    let hertz = wanted.max_hertz.unwrap_or(MAX_HERTZ);
+    if !(MIN_HERTZ..=MAX_HERTZ).contains(&hertz) {
+        let detail = format!("max_hertz is {hertz}, must be {MIN_HERTZ} to {MAX_HERTZ}");
         return Err(Problem::new(Code::InvalidRequest, detail));
     }
     let state = context.state().await;
     let topic = find(state.known(), name, Domain::of(wanted.domain_id).checked()?)?;
-    let permit = STREAMS.try_acquire().map_err(|_| {
+    let permit = STREAM_PERMITS.try_acquire().map_err(|_| {
         let detail = format!("{MAX_READERS} topics are being read, which is the limit");
         Problem::new(Code::TooManyStreams, detail)
     })?;
@@ -239,7 +239,7 @@ impl Pieces for Stream {
             let due = if self.newest.is_some() {
                 due
             } else {
-                self.written + BEAT
+                self.written + HEARTBEAT_INTERVAL
             };
             tokio::select! {
                 biased;
@@ -427,7 +427,7 @@ fn value(
         return Ok(None);
     };
     let limits = Limits {
-        kept: ELEMENTS,
+        kept: MAX_ELEMENTS,
         ..Limits::default()
     };
     let decoded = decode(message_type, payload, &limits)?;
@@ -516,7 +516,7 @@ mod tests {
         let (mut missed, mut kept) = (0, Vec::new());
         while let Some(item) = subscription.try_next() {
             match item {
-                Item::Missed(news) => missed += news.samples,
+                Item::Missed(missed_run) => missed += missed_run.samples,
                 Item::Sample(sample) => kept.push(sample.sequence_number.0),
                 Item::Clock(_) | Item::End(_) => {}
             }

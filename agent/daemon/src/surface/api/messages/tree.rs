@@ -9,13 +9,13 @@ use serde::{Serialize, Serializer};
 use ros2probe_message::{Array, Items, Message, Scalar, Value};
 
 /// Maximum number of array elements shown.
-pub(super) const ELEMENTS: usize = 64;
+pub(super) const MAX_ELEMENTS: usize = 64;
 /// Maximum number of characters shown of a string.
-const CHARACTERS: usize = 1024;
+const MAX_CHARACTERS: usize = 1024;
 /// Maximum number of values shown of a message; 16 characters of a string count as one.
-const VALUES: usize = 20_000;
+const MAX_VALUES: usize = 20_000;
 /// A double represents all integers up to this value exactly.
-const EXACT: u64 = 1 << 53;
+const MAX_EXACT_INTEGER: u64 = 1 << 53;
 
 /// A message to serialize.
 pub(super) struct Tree<'a> {
@@ -30,7 +30,7 @@ impl<'a> Tree<'a> {
     pub(super) const fn new(message: &'a Message<'a>) -> Self {
         Self {
             message,
-            left: Cell::new(VALUES),
+            left: Cell::new(MAX_VALUES),
         }
     }
 }
@@ -77,7 +77,7 @@ impl Serialize for Part<'_, Value<'_>> {
 impl Serialize for Part<'_, Array<'_>> {
     fn serialize<S: Serializer>(&self, out: S) -> Result<S::Ok, S::Error> {
         let Self(array, left) = self;
-        if array.length <= ELEMENTS && left.get() > array.length {
+        if array.length <= MAX_ELEMENTS && left.get() > array.length {
             return Elements(array, left).serialize(out);
         }
         let mut map = out.serialize_map(Some(2))?;
@@ -96,7 +96,7 @@ impl Serialize for Elements<'_> {
         let mut list = out.serialize_seq(None)?;
         match &array.items {
             Items::Scalars(scalars) => {
-                for scalar in scalars.iter().take(ELEMENTS) {
+                for scalar in scalars.iter().take(MAX_ELEMENTS) {
                     if !draw(left, 1) {
                         break;
                     }
@@ -104,7 +104,7 @@ impl Serialize for Elements<'_> {
                 }
             }
             Items::Texts(texts) => {
-                for text in texts.iter().take(ELEMENTS) {
+                for text in texts.iter().take(MAX_ELEMENTS) {
                     if left.get() == 0 {
                         break;
                     }
@@ -112,7 +112,7 @@ impl Serialize for Elements<'_> {
                 }
             }
             Items::Messages(messages) => {
-                for message in messages.iter().take(ELEMENTS) {
+                for message in messages.iter().take(MAX_ELEMENTS) {
                     if left.get() == 0 {
                         break;
                     }
@@ -127,7 +127,7 @@ impl Serialize for Elements<'_> {
 impl Serialize for Part<'_, str> {
     fn serialize<S: Serializer>(&self, out: S) -> Result<S::Ok, S::Error> {
         let Self(text, left) = self;
-        let most = CHARACTERS.min(left.get().saturating_mul(16));
+        let most = MAX_CHARACTERS.min(left.get().saturating_mul(16));
         let cut = text.char_indices().nth(most).map(|(end, _)| end);
         draw(left, 1 + cut.unwrap_or(text.len()) / 16);
         let Some(beginning) = cut.and_then(|end| text.get(..end)) else {
@@ -150,9 +150,9 @@ fn number<S: Serializer>(scalar: Scalar, out: S) -> Result<S::Ok, S::Error> {
     match scalar {
         Scalar::Bool(value) => out.serialize_bool(value),
         Scalar::Byte(value) => out.serialize_u8(value),
-        Scalar::Int(value) if value.unsigned_abs() > EXACT => out.collect_str(&value),
+        Scalar::Int(value) if value.unsigned_abs() > MAX_EXACT_INTEGER => out.collect_str(&value),
         Scalar::Int(value) => out.serialize_i64(value),
-        Scalar::UInt(value) if value > EXACT => out.collect_str(&value),
+        Scalar::UInt(value) if value > MAX_EXACT_INTEGER => out.collect_str(&value),
         Scalar::UInt(value) => out.serialize_u64(value),
         Scalar::Float32(value) => match real(f64::from(value)) {
             Some(word) => out.serialize_str(word),
@@ -177,7 +177,7 @@ mod tests {
         let message_type = MessageType::parse(&name, definition).unwrap();
         let payload = [&[0, 1, 0, 0], body].concat();
         let limits = Limits {
-            kept: ELEMENTS,
+            kept: MAX_ELEMENTS,
             ..Limits::default()
         };
         let decoded = decode(&message_type, &payload, &limits).unwrap();
@@ -216,10 +216,16 @@ mod tests {
         body.push(0);
         let seen = parsed(&shown("uint8[] data\nstring text", &body));
         assert_eq!(seen["data"]["$length"], 1000);
-        assert_eq!(seen["data"]["$items"].as_array().unwrap().len(), ELEMENTS);
+        assert_eq!(
+            seen["data"]["$items"].as_array().unwrap().len(),
+            MAX_ELEMENTS
+        );
         assert_eq!(seen["data"]["$items"][63], 63);
         assert_eq!(seen["text"]["$length"], 2000);
-        assert_eq!(seen["text"]["$text"].as_str().unwrap().len(), CHARACTERS);
+        assert_eq!(
+            seen["text"]["$text"].as_str().unwrap().len(),
+            MAX_CHARACTERS
+        );
     }
 
     #[test]

@@ -33,12 +33,12 @@ use super::problem::{Code, Problem};
 pub(super) use tokens::Tokens;
 
 /// The page can only load from and connect to its own origin.
-const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' \
+const PAGE_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' \
     data: blob:; connect-src 'self'; worker-src 'self'; manifest-src 'self'; base-uri 'none'; \
     form-action 'none'; frame-ancestors 'none'";
 /// Headers of every file.
-const HEADERS: [(HeaderName, &str); 7] = [
-    (CONTENT_SECURITY_POLICY, POLICY),
+const PAGE_HEADERS: [(HeaderName, &str); 7] = [
+    (CONTENT_SECURITY_POLICY, PAGE_POLICY),
     (X_CONTENT_TYPE_OPTIONS, "nosniff"),
     (REFERRER_POLICY, "no-referrer"),
     (
@@ -54,7 +54,7 @@ const HEADERS: [(HeaderName, &str); 7] = [
     (VARY, "accept-encoding"),
 ];
 /// Bytes of a file's hash that identify its version.
-const TAG: usize = 16;
+const TAG_BYTES: usize = 16;
 
 /// State of the web page, shared by listeners and routes.
 #[derive(Debug, Default)]
@@ -65,7 +65,7 @@ pub struct Page {
 }
 
 /// The files of the page with their derived forms.
-static FILES: LazyLock<Vec<Served>> = LazyLock::new(|| {
+static SERVED_FILES: LazyLock<Vec<Served>> = LazyLock::new(|| {
     let served = |file| Served {
         file,
         forms: OnceLock::new(),
@@ -117,7 +117,7 @@ impl Served {
     fn forms(&self) -> &Forms {
         self.forms.get_or_init(|| {
             let hash = Sha256::digest(self.file.bytes);
-            let tag = hash.iter().take(TAG);
+            let tag = hash.iter().take(TAG_BYTES);
             Forms {
                 tag: tag.map(|byte| format!("{byte:02x}")).collect(),
                 packed: packed(self.file.bytes).into(),
@@ -141,7 +141,7 @@ impl Served {
             let known = known.trim();
             known == "*" || known.trim_start_matches("W/") == tag
         });
-        let always = (HEADERS, [(ETAG, tag)]);
+        let always = (PAGE_HEADERS, [(ETAG, tag)]);
         if is_known {
             return (StatusCode::NOT_MODIFIED, always).into_response();
         }
@@ -199,7 +199,7 @@ async fn file(Path(path): Path<String>, headers: HeaderMap) -> Response {
 }
 
 fn find(path: &str, headers: &HeaderMap) -> Response {
-    let file = FILES.iter().find(|served| served.file.path == path);
+    let file = SERVED_FILES.iter().find(|served| served.file.path == path);
     let missing = || Problem::new(Code::NotFound, "the page has no such file").into_response();
     file.map_or_else(missing, |file| file.answer(headers))
 }
@@ -220,7 +220,7 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
     responses((status = 200, description = "A new token.", body = PageToken))
 )]
 async fn token(State(context): State<Context>) -> Result<Json<PageToken>, Problem> {
-    let token = context.page.tokens.mint();
+    let token = context.page.tokens.create();
     let token = token.map_err(|error| Problem::new(Code::StorageRefuses, error.to_string()))?;
     Ok(Json(PageToken {
         token,
@@ -283,13 +283,13 @@ mod tests {
         let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../page");
         let mut expected = BTreeSet::new();
         listed(&folder, "", &mut expected);
-        let served: BTreeSet<_> = FILES
+        let served: BTreeSet<_> = SERVED_FILES
             .iter()
             .map(|served| served.file.path.to_owned())
             .collect();
         assert_eq!(served, expected);
         assert!(served.contains("index.html"));
-        for file in FILES.iter().map(|served| served.file) {
+        for file in SERVED_FILES.iter().map(|served| served.file) {
             let (_, end) = file.path.rsplit_once('.').unwrap();
             let expected = match end {
                 "html" => "text/html; charset=utf-8",
@@ -310,7 +310,7 @@ mod tests {
 
     #[test]
     fn the_compressed_page_stays_within_its_size_budget() {
-        let sizes = FILES
+        let sizes = SERVED_FILES
             .iter()
             .map(|served| match served.forms().packed.len() {
                 0 => served.file.bytes.len(),
@@ -323,7 +323,7 @@ mod tests {
 
     #[test]
     fn a_file_that_the_client_has_is_not_sent_again() {
-        let file = FILES
+        let file = SERVED_FILES
             .iter()
             .find(|served| served.file.path == "index.html")
             .unwrap();

@@ -24,7 +24,7 @@ use ros2probe_api::history::{DiskHistory, HistorySpan, ProcessColumns, ProcessHi
 use ros2probe_history::{ProcessName, ProcessRow, Span, Store, merge_by_name};
 
 pub(super) use query::TopicRange;
-use query::{Range, read_store};
+use query::{TimeRange, read_store};
 pub(super) use topic::show as show_topic;
 pub use writer::HistoryWriter;
 
@@ -33,8 +33,8 @@ const MAX_EVENT_BYTES: usize = 8 << 20;
 
 pub(super) fn routes() -> OpenApiRouter<Context> {
     OpenApiRouter::new()
-        .routes(routes!(about))
-        .routes(routes!(moment))
+        .routes(routes!(get_history))
+        .routes(routes!(get_moment))
         .routes(routes!(processes))
         .routes(routes!(events))
 }
@@ -43,7 +43,7 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
 #[derive(Clone, Copy, Debug, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
-struct Moment {
+struct MomentQuery {
     /// Unix time.
     #[param(minimum = 0, example = 1_790_000_000)]
     at: f64,
@@ -51,15 +51,15 @@ struct Moment {
 
 /// Size and reach of the history on disk
 ///
-/// The agent writes it each minute (`page.history_bytes`): the figures of each measured topic and of
-/// the robot's processes, the events, and the state of the robot.
+/// The agent writes it each minute (`page.history_bytes`): the figures of each measured topic and
+/// of the robot's processes, the events, and the state of the robot.
 #[utoipa::path(
     get,
     path = "/history",
     tag = "graph",
     responses((status = 200, description = "The history.", body = DiskHistory))
 )]
-async fn about(State(context): State<Context>) -> Json<DiskHistory> {
+async fn get_history(State(context): State<Context>) -> Json<DiskHistory> {
     let history = &context.disk_history;
     let [writes, failed_writes] = history.writes();
     let span = |span: Option<Span>| {
@@ -90,7 +90,7 @@ async fn about(State(context): State<Context>) -> Json<DiskHistory> {
     get,
     path = "/history/moment",
     tag = "graph",
-    params(Moment),
+    params(MomentQuery),
     responses(
         (status = 200, description = "The lines of the state.",
             body = ros2probe_api::live::Line<'static>, content_type = "application/x-ndjson"),
@@ -100,9 +100,9 @@ async fn about(State(context): State<Context>) -> Json<DiskHistory> {
             body = ProblemBody, content_type = "application/problem+json"),
     )
 )]
-async fn moment(
+async fn get_moment(
     State(context): State<Context>,
-    Parameters(moment): Parameters<Moment>,
+    Parameters(moment): Parameters<MomentQuery>,
 ) -> Result<Response, Problem> {
     let at = query::second(moment.at)?;
     let lines = read_store(&context, move |store| {
@@ -125,7 +125,7 @@ async fn moment(
     get,
     path = "/history/processes",
     tag = "graph",
-    params(Range),
+    params(TimeRange),
     responses(
         (status = 200, description = "The processes of that time.", body = ProcessHistory),
         (status = 404, description = "No history is kept.",
@@ -136,7 +136,7 @@ async fn moment(
 )]
 async fn processes(
     State(context): State<Context>,
-    Parameters(range): Parameters<Range>,
+    Parameters(range): Parameters<TimeRange>,
 ) -> Result<Json<ProcessHistory>, Problem> {
     let range = range.checked(query::now(&context))?;
     let all = read_store(&context, move |store| {
@@ -174,7 +174,7 @@ async fn processes(
     get,
     path = "/history/events",
     tag = "events",
-    params(Range),
+    params(TimeRange),
     responses(
         (status = 200, description = "The events, the oldest first.",
             body = ros2probe_api::events::Event<'static>, content_type = "application/x-ndjson"),
@@ -186,7 +186,7 @@ async fn processes(
 )]
 async fn events(
     State(context): State<Context>,
-    Parameters(range): Parameters<Range>,
+    Parameters(range): Parameters<TimeRange>,
 ) -> Result<Response, Problem> {
     let range = range.checked(query::now(&context))?;
     let text = read_store(&context, move |store| {

@@ -10,27 +10,27 @@ use utoipa::IntoParams;
 use super::super::Context;
 use super::super::problem::{Code, Problem};
 use super::super::scope::Domain;
-use super::super::turns::{NoResult, in_turn};
+use super::super::turns::{NoResult, run_blocking};
 use super::writer::seconds;
 use ros2probe_history::Store;
 
 /// Number of answers that read the storage at the same time.
-const READERS: usize = 2;
-static TURNS: Semaphore = Semaphore::const_new(READERS);
+const MAX_READERS: usize = 2;
+static READER_PERMITS: Semaphore = Semaphore::const_new(MAX_READERS);
 /// Maximum number of rows in an answer; a smaller step becomes longer.
 const MAX_ROWS: u32 = 2_000;
 /// Number of rows in an answer without `step`.
-const ROWS: u32 = 600;
+const DEFAULT_ROWS: u32 = 600;
 /// Time of an answer without `from`, in seconds.
-const HOUR: u32 = 3_600;
+const DEFAULT_SPAN_SECONDS: u32 = 3_600;
 /// Maximum time of an answer.
-const READ_WITHIN: Duration = Duration::from_secs(10);
+const READ_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// Times of a question.
 #[derive(Clone, Copy, Debug, Default, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields, default)]
 #[into_params(parameter_in = Query)]
-pub(in super::super) struct Range {
+pub(in super::super) struct TimeRange {
     /// Unix time of the begin; an hour before `to` by default.
     #[param(example = 1_790_000_000)]
     pub(in super::super) from: Option<f64>,
@@ -73,7 +73,7 @@ pub(in super::super) struct Times {
 
 impl TopicRange {
     /// Returns the domain and, unless only the last minutes are requested, the times.
-    pub(in super::super) fn parts(self) -> (Domain, Option<Range>) {
+    pub(in super::super) fn parts(self) -> (Domain, Option<TimeRange>) {
         let Self {
             domain_id,
             from,
@@ -81,21 +81,23 @@ impl TopicRange {
             step,
         } = self;
         let is_empty = from.is_none() && to.is_none() && step.is_none();
-        let range = (!is_empty).then_some(Range { from, to, step });
+        let range = (!is_empty).then_some(TimeRange { from, to, step });
         (Domain::of(domain_id), range)
     }
 }
 
-impl Range {
+impl TimeRange {
     /// # Errors
     /// Fails if the end is before the begin, or a number is impossible.
     pub(in super::super) fn checked(self, now: u32) -> Result<Times, Problem> {
         let to = self.to.map_or(Ok(now), second)?;
-        let from = self.from.map_or(Ok(to.saturating_sub(HOUR)), second)?;
+        let from = self
+            .from
+            .map_or(Ok(to.saturating_sub(DEFAULT_SPAN_SECONDS)), second)?;
         let span = to.checked_sub(from).filter(|span| *span > 0);
         let span = span.ok_or_else(|| invalid("`to` must be later than `from`"))?;
         let step = match self.step {
-            None => span.div_ceil(ROWS),
+            None => span.div_ceil(DEFAULT_ROWS),
             Some(0) => return Err(invalid("`step` must be at least 1")),
             Some(step) => step.max(span.div_ceil(MAX_ROWS)),
         };
@@ -133,8 +135,8 @@ pub(super) fn now(context: &Context) -> u32 {
     seconds(context.latest.state().known().time())
 }
 
-/// Reads the store on another thread. A storage that hangs holds [`READERS`] threads, whatever the
-/// number of clients, and no client longer than [`READ_WITHIN`].
+/// Reads the store on another thread. A storage that hangs holds [`MAX_READERS`] threads, whatever
+/// the number of clients, and no client longer than [`READ_TIMEOUT`].
 ///
 /// # Errors
 /// Fails if no history is kept, if the storage does not answer, or if the agent stops.
@@ -148,7 +150,10 @@ pub(in super::super) async fn read_store<T: Send + 'static>(
     if !history.is_kept() {
         return Err(missing(none));
     }
-    let answer = in_turn(&TURNS, READ_WITHIN, move || history.opened().map(read)).await;
+    let answer = run_blocking(&READER_PERMITS, READ_TIMEOUT, move || {
+        history.opened().map(read)
+    })
+    .await;
     match answer {
         Ok(answer) => answer.ok_or_else(|| missing(none)),
         Err(NoResult::Late) => Err(missing("the storage of the history does not answer")),
@@ -168,7 +173,7 @@ mod tests {
     fn a_range_has_at_most_as_many_rows_as_an_answer_may_have() {
         let range = |from: f64, to: f64, step: Option<u32>| {
             let (from, to) = (Some(from), Some(to));
-            Range { from, to, step }.checked(5_000)
+            TimeRange { from, to, step }.checked(5_000)
         };
         let times = |from, to, step| Times { from, to, step };
         assert_eq!(range(0.0, 600.0, None).unwrap(), times(0, 600, 1));
@@ -178,7 +183,7 @@ mod tests {
             range(0.0, 86_400.0, Some(600)).unwrap(),
             times(0, 86_400, 600)
         );
-        let hour = Range::default().checked(5_000).unwrap();
+        let hour = TimeRange::default().checked(5_000).unwrap();
         assert_eq!(hour, times(1_400, 5_000, 6));
         for (from, to, step) in [
             (600.0, 600.0, None),

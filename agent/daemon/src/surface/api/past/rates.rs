@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use serde::Deserialize;
 
 use super::super::body_stream::write_line;
-use super::super::live::rate_steps::{Part, RateSteps, STEP, STEPS};
+use super::super::live::rate_steps::{MAX_STEPS, Part, RateSteps, STEP_SECONDS};
 use ros2probe_api::live::{History, Line};
 use ros2probe_history::{Store, TopicName};
 
@@ -49,21 +49,26 @@ fn topics(lines: &[u8]) -> BTreeMap<TopicName, u32> {
 }
 
 fn rates(topics: &BTreeMap<TopicName, u32>, store: &Store, at: u32) -> History {
-    let end = at.div_ceil(STEP);
-    let first = end.saturating_sub(STEPS);
+    let end = at.div_ceil(STEP_SECONDS);
+    let first = end.saturating_sub(MAX_STEPS);
     let mut sums = RateSteps::new((end - first) as usize);
-    store.topics(first * STEP..at, STEP, &|_| true, &mut |name, row| {
-        let place = row.at.div_ceil(STEP).saturating_sub(first + 1);
-        let part = Part {
-            messages: row.messages,
-            bytes: row.bytes as f64,
-            lost: row.lost,
-            seconds: row.seconds,
-        };
-        sums.add(place as usize, topics.get(name).copied(), part);
-    });
-    let ends = (first + 1..=end).map(|step| f64::from((step * STEP).min(at)));
-    sums.history(ends.map(|end| (end, f64::from(STEP))))
+    store.topics(
+        first * STEP_SECONDS..at,
+        STEP_SECONDS,
+        &|_| true,
+        &mut |name, row| {
+            let place = row.at.div_ceil(STEP_SECONDS).saturating_sub(first + 1);
+            let part = Part {
+                messages: row.messages,
+                bytes: row.bytes as f64,
+                lost: row.lost,
+                seconds: row.seconds,
+            };
+            sums.add(place as usize, topics.get(name).copied(), part);
+        },
+    );
+    let ends = (first + 1..=end).map(|step| f64::from((step * STEP_SECONDS).min(at)));
+    sums.history(ends.map(|end| (end, f64::from(STEP_SECONDS))))
 }
 
 #[cfg(test)]
@@ -73,7 +78,7 @@ mod tests {
     use ros2probe_history::{Block, Series, Tier, TopicRow};
 
     #[test]
-    fn the_rates_before_a_moment_stand_in_front_of_the_values() {
+    fn the_rates_before_a_moment_precede_the_values() {
         let directory = tempfile::tempdir().unwrap();
         let store = Store::open(directory.path(), 1 << 20).unwrap();
         let row = |at| TopicRow {

@@ -6,25 +6,25 @@ use axum::Json;
 use axum::response::{IntoResponse, Response};
 
 use super::super::Context;
-use super::super::history::{short, thousandths};
+use super::super::history::{stored_precision, thousandths};
 use super::super::problem::{Code, Problem};
 use super::super::scope::Domain;
 use super::super::topics::find;
-use super::query::{self, Range, Times};
+use super::query::{self, TimeRange, Times};
 use super::writer::{seconds, topic_row};
 use ros2probe_api::topics::History;
 use ros2probe_history::{Tier, TopicName, TopicRow, merge_into};
 use ros2probe_wire::DomainId;
 
 /// Time over which a rate is taken, in seconds.
-const WINDOW: u32 = 10;
+const RATE_WINDOW_SECONDS: u32 = 10;
 
 /// Answers with the history of a topic, also of one that no longer exists.
 pub(in super::super) async fn show(
     context: &Context,
     name: &str,
     domain: Domain,
-    range: Range,
+    range: TimeRange,
 ) -> Result<Response, Problem> {
     let times = range.checked(query::now(context))?;
     let state = context.latest.state();
@@ -52,11 +52,11 @@ pub(in super::super) async fn show(
         };
         let seconds = store.span(Tier::Seconds);
         if seconds.is_none_or(|seconds| seconds.begin > times.from) {
-            times.step = times.step.max(WINDOW);
+            times.step = times.step.max(RATE_WINDOW_SECONDS);
         }
         let (mut steps, mut first) = (Vec::new(), None::<TopicName>);
         // The rate of the first row needs the time before it.
-        let begin = times.from.saturating_sub(WINDOW);
+        let begin = times.from.saturating_sub(RATE_WINDOW_SECONDS);
         store.topics(begin..times.to, times.step, &is_wanted, &mut |of, row| {
             // A former topic of this name may have been in several domains. The first one is
             // shown; `domain_id` selects another.
@@ -103,7 +103,7 @@ fn columns(steps: &[TopicRow], times: Times) -> History {
     for end in (first..=times.to.next_multiple_of(times.step)).step_by(times.step as usize) {
         let row = steps.next_if(|row| row.at <= end);
         window.extend(row);
-        let reach = WINDOW.max(times.step);
+        let reach = RATE_WINDOW_SECONDS.max(times.step);
         while window
             .front()
             .is_some_and(|oldest| oldest.at + reach <= end)
@@ -137,7 +137,7 @@ fn columns(steps: &[TopicRow], times: Times) -> History {
                 interarrival.map(|[_, high]| high),
             ),
         ] {
-            column.push(value.map(short));
+            column.push(value.map(stored_precision));
         }
     }
     view

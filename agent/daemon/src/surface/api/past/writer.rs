@@ -21,20 +21,20 @@ use super::super::events::event;
 use super::super::processes::{MAX_PROCESSES, local};
 use super::super::{Context, live};
 use crate::events::Reader;
-use crate::state::{ENDING, join_until};
+use crate::state::{END_TIMEOUT, join_until};
 use crate::surface::process::{Usage, script};
 
 /// Time between two readings of the processes.
-const READING: Duration = Duration::from_secs(1);
+const PROCESS_READ_INTERVAL: Duration = Duration::from_secs(1);
 /// Number of readings after which the events are read, and after which everything is written.
-const READINGS_OF_EVENTS: u32 = 10;
-const READINGS: u32 = 60;
+const PROCESS_READS_PER_EVENT_WRITE: u32 = 10;
+const PROCESS_READS_PER_WRITE: u32 = 60;
 /// Time within which the working thread publishes a requested state, unless the machine is busy.
-const PUBLICATION: Duration = Duration::from_secs(2);
+const PUBLICATION_TIMEOUT: Duration = Duration::from_secs(2);
 /// Number of these times after which an old state is written.
-const PUBLICATIONS: u32 = 10;
+const MAX_PUBLICATION_TIMEOUTS: u32 = 10;
 /// Number of events read at once.
-const BATCH: usize = 512;
+const EVENT_BATCH: usize = 512;
 /// Maximum length of the events of a minute, in bytes.
 const MAX_EVENT_BYTES: usize = 4 << 20;
 
@@ -91,7 +91,7 @@ impl HistoryWriter {
     pub fn finish(self) {
         let Self { end, thread } = self;
         drop(end);
-        if !join_until(thread, Instant::now() + ENDING) {
+        if !join_until(thread, Instant::now() + END_TIMEOUT) {
             tracing::error!(
                 "the file system does not answer: the last minute is not in the history"
             );
@@ -117,13 +117,13 @@ impl Minute {
             return;
         }
         let mut readings = 0;
-        while let Err(RecvTimeoutError::Timeout) = ended.recv_timeout(READING) {
+        while let Err(RecvTimeoutError::Timeout) = ended.recv_timeout(PROCESS_READ_INTERVAL) {
             readings += 1;
             self.read_processes();
-            if readings % READINGS_OF_EVENTS == 0 {
+            if readings % PROCESS_READS_PER_EVENT_WRITE == 0 {
                 self.read_events();
             }
-            if readings % READINGS == 0 {
+            if readings % PROCESS_READS_PER_WRITE == 0 {
                 if !self.wait_for_publication(ended) {
                     break;
                 }
@@ -135,14 +135,14 @@ impl Minute {
         self.write();
     }
 
-    /// Waits until the working thread has published, which it does for readers only. Returns false if
-    /// the agent ends.
+    /// Waits until the working thread has published, which it does for readers only. Returns false
+    /// if the agent ends.
     fn wait_for_publication(&self, ended: &Receiver<()>) -> bool {
         let latest = &self.context.latest;
         let before = latest.past();
-        for _ in 0..PUBLICATIONS {
+        for _ in 0..MAX_PUBLICATION_TIMEOUTS {
             let _ = latest.state();
-            if ended.recv_timeout(PUBLICATION) != Err(RecvTimeoutError::Timeout) {
+            if ended.recv_timeout(PUBLICATION_TIMEOUT) != Err(RecvTimeoutError::Timeout) {
                 return false;
             }
             if !Arc::ptr_eq(&before, &latest.past()) {
@@ -156,14 +156,14 @@ impl Minute {
     fn read_events(&mut self) {
         let log = &self.context.events;
         loop {
-            let batch = log.read(self.place, BATCH);
+            let batch = log.read(self.place, EVENT_BATCH);
             let mut lagged = batch.lagged;
             let is_last = batch.records.is_empty();
             for record in &batch.records {
                 let is_kept = self.events.add(&event(log, record));
                 lagged += u64::from(!is_kept);
             }
-            log.overtook(Reader::History, lagged);
+            log.count_overwritten(Reader::History, lagged);
             self.place = batch.last;
             if is_last {
                 return;
@@ -232,7 +232,7 @@ impl Minute {
             end: now,
             content,
         };
-        blocks.push(text(Kind::State, live::whole_state(&self.context)));
+        blocks.push(text(Kind::State, live::initial_lines(&self.context)));
         let EventLines(events) = std::mem::take(&mut self.events);
         if !events.is_empty() {
             blocks.push(text(Kind::Events, events));

@@ -19,19 +19,19 @@ fn headers(pairs: &[(&str, &str)]) -> HeaderMap {
 }
 
 /// Returns the code of the refusal, if the request is refused.
-fn refusal(door: &Door, pairs: &[(&str, &str)]) -> Option<Code> {
-    let answer = door.let_in(&headers(pairs), Instant::now());
+fn refusal(door: &AccessRules, pairs: &[(&str, &str)]) -> Option<Code> {
+    let answer = door.check_request(&headers(pairs), Instant::now());
     answer.err().map(|problem| problem.code())
 }
 
 /// Returns access rules that grant all rights.
-fn door(kind: Kind) -> Door {
-    Door::new(kind, Granted::new(Access::All, None))
+fn access_rules(kind: Kind) -> AccessRules {
+    AccessRules::new(kind, Rights::new(Access::All, None))
 }
 
 #[test]
 fn a_loopback_listener_refuses_requests_for_foreign_hosts() {
-    let door = door(Kind::Loopback(None));
+    let door = access_rules(Kind::Loopback(None));
     for host in ["localhost", "127.0.0.1:17401", "[::1]:9000"] {
         assert_eq!(refusal(&door, &[("host", host)]), None, "{host}");
     }
@@ -46,7 +46,7 @@ fn a_loopback_listener_refuses_requests_for_foreign_hosts() {
 
 #[test]
 fn a_request_with_a_foreign_origin_among_several_is_refused() {
-    let door = door(Kind::Loopback(None));
+    let door = access_rules(Kind::Loopback(None));
     let own = ("origin", "http://localhost");
     for second in [
         ("origin", "http://evil.example"),
@@ -69,14 +69,18 @@ fn refused_requests_do_not_use_up_the_rate_of_admitted_clients() {
         ("authorization", "Bearer 0123456789abcdef"),
     ]);
     for (door, outsider, client) in [
-        (door(Kind::Network(token())), HeaderMap::new(), right),
         (
-            door(Kind::Loopback(None)),
+            access_rules(Kind::Network(token())),
+            HeaderMap::new(),
+            right,
+        ),
+        (
+            access_rules(Kind::Loopback(None)),
             foreign,
             headers(&[("host", "localhost")]),
         ),
     ] {
-        let answered = |headers: &HeaderMap| match door.let_in(headers, now) {
+        let answered = |headers: &HeaderMap| match door.check_request(headers, now) {
             Err(problem) if problem.code() == Code::TooManyRequests => 0,
             _ => 1,
         };
@@ -91,17 +95,17 @@ fn refused_requests_do_not_use_up_the_rate_of_admitted_clients() {
 fn clients_without_a_token_do_not_use_up_the_rate_of_page_tokens() {
     let now = Instant::now();
     let page = page::Shared::default();
-    let token = page.tokens.mint().unwrap();
-    let granted = Granted::new(Access::Watch, None);
-    let door = Door::new(Kind::Loopback(None), granted).with(page);
+    let token = page.tokens.create().unwrap();
+    let granted = Rights::new(Access::Watch, None);
+    let door = AccessRules::new(Kind::Loopback(None), granted).with(page);
     let plain = headers(&[("host", "localhost")]);
     let bearer = format!("Bearer {token}");
     let holder = headers(&[("host", "localhost"), ("authorization", &bearer)]);
-    let answered = (0..5_000).filter(|_| door.let_in(&plain, now).is_ok());
+    let answered = (0..5_000).filter(|_| door.check_request(&plain, now).is_ok());
     assert_eq!(answered.count(), 1_000);
     let answered = (0..370).filter(|_| {
-        let granted = door.let_in(&holder, now);
-        granted.is_ok_and(|granted| granted.is_holder() && granted.access() == Access::All)
+        let granted = door.check_request(&holder, now);
+        granted.is_ok_and(|granted| granted.has_token() && granted.access() == Access::All)
     });
     assert_eq!(answered.count(), 370);
 }
@@ -118,7 +122,7 @@ fn loopback_grants_the_configured_rights_and_socket_and_token_grant_all() {
             assert_eq!(kind.access(loopback), Access::All);
         }
     }
-    let granted = Granted::new(Access::Watch, Some(Path::new("/run/a.sock").into()));
+    let granted = Rights::new(Access::Watch, Some(Path::new("/run/a.sock").into()));
     assert!(granted.require(Access::Read).is_ok() && granted.require(Access::Watch).is_ok());
     let refused = granted.require(Access::All).unwrap_err();
     assert_eq!(refused.code(), Code::NeedsSocket);
@@ -130,7 +134,10 @@ fn loopback_grants_the_configured_rights_and_socket_and_token_grant_all() {
 
 #[test]
 fn requests_from_web_pages_of_other_origins_are_refused() {
-    for door in [door(Kind::Loopback(None)), door(Kind::Network(token()))] {
+    for door in [
+        access_rules(Kind::Loopback(None)),
+        access_rules(Kind::Network(token())),
+    ] {
         let host = ("host", "localhost:17401");
         let bearer = ("authorization", "Bearer 0123456789abcdef");
         let answer = |pair| refusal(&door, &[host, bearer, pair]);
@@ -157,8 +164,8 @@ fn requests_from_web_pages_of_other_origins_are_refused() {
 #[test]
 fn a_configured_token_is_required_except_on_the_unix_socket() {
     for door in [
-        door(Kind::Network(token())),
-        door(Kind::Loopback(Some(token()))),
+        access_rules(Kind::Network(token())),
+        access_rules(Kind::Loopback(Some(token()))),
     ] {
         let with = |value| refusal(&door, &[("host", "localhost"), ("authorization", value)]);
         assert_eq!(with("Bearer 0123456789abcdef"), None);
@@ -182,14 +189,14 @@ fn a_configured_token_is_required_except_on_the_unix_socket() {
         ("host", "robot1:17401"),
         ("authorization", "Bearer 0123456789abcdef"),
     ];
-    assert_eq!(refusal(&door(Kind::Network(token())), &named), None);
+    assert_eq!(refusal(&access_rules(Kind::Network(token())), &named), None);
     let anything = [("host", "evil.example"), ("origin", "http://evil.example")];
-    assert_eq!(refusal(&door(Kind::Socket), &anything), None);
+    assert_eq!(refusal(&access_rules(Kind::Socket), &anything), None);
 }
 
 #[test]
 fn a_long_body_is_refused_before_it_is_read() {
-    let door = door(Kind::Socket);
+    let door = access_rules(Kind::Socket);
     let length = |length: &str| refusal(&door, &[("content-length", length)]);
     assert_eq!(length("16384"), None);
     assert_eq!(length("16385"), Some(Code::BodyTooLarge));
@@ -199,17 +206,17 @@ fn a_long_body_is_refused_before_it_is_read() {
 fn a_flood_exceeds_the_rate_limit_until_the_bucket_refills() {
     let start = Instant::now();
     let mut bucket = Bucket {
-        left: BURST,
+        left: REQUEST_BURST,
         at: start,
     };
     let drawn = (0..2000).filter(|_| bucket.draw(start)).count();
     assert_eq!(drawn, 1000);
     let later = start + Duration::from_millis(10);
     assert_eq!((0..100).filter(|_| bucket.draw(later)).count(), 5);
-    let door = door(Kind::Socket);
-    let refused = |_: &u32| door.let_in(&HeaderMap::new(), start).is_err();
+    let door = access_rules(Kind::Socket);
+    let refused = |_: &u32| door.check_request(&HeaderMap::new(), start).is_err();
     assert_eq!((0..2000).filter(refused).count(), 1000);
-    let again = door.let_in(&HeaderMap::new(), start).unwrap_err();
+    let again = door.check_request(&HeaderMap::new(), start).unwrap_err();
     assert_eq!(again.code(), Code::TooManyRequests);
 
     let rested = start + Duration::from_secs(3600);

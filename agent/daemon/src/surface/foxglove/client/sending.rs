@@ -10,10 +10,10 @@ use tokio_tungstenite::tungstenite::protocol::frame::coding::{CloseCode, Data, O
 use tokio_tungstenite::tungstenite::{Error, Message as Incoming};
 
 use super::super::protocol::{Level, Message, data_head};
-use super::{Client, End, FRAGMENT};
+use super::{Client, End, FRAGMENT_BYTES};
 
 /// Maximum number of bytes that a client may send until it reads why its connection is closed.
-const FAREWELL_BYTES: u64 = 1 << 20;
+const CLOSE_READ_BYTES: u64 = 1 << 20;
 
 impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
     pub(super) async fn status(
@@ -38,7 +38,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
         payload: &Bytes,
     ) -> Result<(), End> {
         let head = data_head(id, time);
-        let first = payload.len().min(FRAGMENT - head.len());
+        let first = payload.len().min(FRAGMENT_BYTES - head.len());
         let mut message = BytesMut::with_capacity(head.len() + first);
         message.extend_from_slice(&head);
         message.extend_from_slice(payload.get(..first).unwrap_or_default());
@@ -56,7 +56,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
     async fn fragments(&mut self, mut rest: Bytes, first: Data) -> Result<(), End> {
         let mut data = first;
         loop {
-            let part = rest.split_to(rest.len().min(FRAGMENT));
+            let part = rest.split_to(rest.len().min(FRAGMENT_BYTES));
             self.frame(part, data, rest.is_empty()).await?;
             if rest.is_empty() {
                 return Ok(());
@@ -78,7 +78,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
 
     /// Sends the reason for the end, and reads until the client closes the connection. Closing with
     /// unread data would reset the connection and might lose the reason.
-    pub(super) async fn say_farewell(
+    pub(super) async fn close_with_reason(
         &mut self,
         code: CloseCode,
         reason: &'static str,
@@ -87,7 +87,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
         self.socket.close(Some(CloseFrame { code, reason })).await?;
         let stream = self.socket.get_mut();
         stream.shutdown().await?;
-        tokio::io::copy(&mut stream.take(FAREWELL_BYTES), &mut tokio::io::sink()).await?;
+        tokio::io::copy(&mut stream.take(CLOSE_READ_BYTES), &mut tokio::io::sink()).await?;
         Ok(())
     }
 }

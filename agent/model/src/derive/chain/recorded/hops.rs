@@ -13,11 +13,11 @@ use crate::derive::chain::trace::{Method, Path, Point, Trace, paths};
 use crate::facts::names::TopicName;
 
 /// Minimum number of matches of an accepted hop.
-const ENOUGH: u64 = 5;
+const MIN_MATCHES: u64 = 5;
 /// Messages of one stamp that are less than this many nanoseconds apart are published together.
-const TOGETHER: i64 = 1_000_000;
+const SIMULTANEOUS_NANOSECONDS: i64 = 1_000_000;
 /// Maximum number of stamps from which the delays of three topics are computed.
-const SAMPLES: usize = 4096;
+const MAX_STAMPS: usize = 4096;
 
 /// Results of the search for hops in a recording.
 #[derive(Default)]
@@ -100,7 +100,7 @@ pub(super) fn find(recorded: &RecordedChains, times: Times, preferred: &[&str]) 
     }
     for (topic, causes) in &causes {
         let is_hop = causes.matched.keys().any(|input| accepts(*input, *topic));
-        if causes.unclear >= ENOUGH && !is_hop {
+        if causes.unclear >= MIN_MATCHES && !is_hop {
             let names = causes.candidates.iter().map(|input| recorded.name(*input));
             let unclear = (recorded.name(*topic), names.collect());
             found.unclear.push(unclear);
@@ -119,7 +119,7 @@ impl Causes {
     fn accepts(&self, input: u16, stamps: u64) -> bool {
         let matched = self.matched.get(&input).copied().unwrap_or(0);
         let all: u64 = self.matched.values().sum();
-        matched >= ENOUGH && matched * 10 >= stamps && all * 5 >= stamps * 4
+        matched >= MIN_MATCHES && matched * 10 >= stamps && all * 5 >= stamps * 4
     }
 }
 
@@ -128,7 +128,7 @@ impl Causes {
 fn follows(recorded: &RecordedChains, pairs: &Pairs, input: u16, output: u16) -> bool {
     pairs.get(&(input, output)).is_some_and(|pair| {
         let late = pair.both - pair.before;
-        pair.before >= ENOUGH
+        pair.before >= MIN_MATCHES
             && late * 50 <= pair.before
             && pair.before * 10 >= recorded.stamps_of(output)
     })
@@ -184,7 +184,7 @@ fn relations(
                         continue;
                     }
                     let known = delays.entry([*first, *second, *third]).or_default();
-                    if known.len() < SAMPLES {
+                    if known.len() < MAX_STAMPS {
                         let delay = |at: &Timestamp| (*at - *start).as_secs_f64();
                         known.push((delay(middle), delay(end)));
                     }
@@ -209,7 +209,7 @@ fn together(recorded: &RecordedChains, stamps: &Stamps, preferred: &[&str]) -> B
             for (other, end) in stamp.get(place + 1..).unwrap_or_default() {
                 let pair = pairs.entry((*one.min(other), *one.max(other))).or_default();
                 pair.0 += 1;
-                let is_near = end.nanoseconds_since(*start).abs() < TOGETHER;
+                let is_near = end.nanoseconds_since(*start).abs() < SIMULTANEOUS_NANOSECONDS;
                 pair.1 += u64::from(is_near);
                 *led.entry(*one).or_default() += u64::from(is_near);
             }
@@ -220,7 +220,7 @@ fn together(recorded: &RecordedChains, stamps: &Stamps, preferred: &[&str]) -> B
         |leads: &BTreeMap<u16, u16>, topic: u16| leads.get(&topic).copied().unwrap_or(topic);
     for ((one, other), (both, near)) in &pairs {
         let fewest = recorded.stamps_of(*one).min(recorded.stamps_of(*other));
-        if *both < ENOUGH || both * 5 < fewest * 4 || near * 2 < *both {
+        if *both < MIN_MATCHES || both * 5 < fewest * 4 || near * 2 < *both {
             continue;
         }
         let (one, other) = (lead_of(&leads, *one), lead_of(&leads, *other));

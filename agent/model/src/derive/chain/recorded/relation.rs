@@ -6,9 +6,9 @@
 //! standard error. If that leaves both cases possible, the relation is unclear.
 
 /// Minimum number of stamps for the computation of a relation.
-const FEWEST: usize = 20;
+const MIN_STAMPS: usize = 20;
 /// One in this many delays is left out at each end, because stalls delay all nodes together.
-const OUTER: usize = 20;
+const TRIMMED_DIVISOR: usize = 20;
 
 /// The relation of three topics.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -33,7 +33,7 @@ pub(super) fn relation(delays: &[(f64, f64)]) -> Relation {
             (second.0..=second.1).contains(one) && (third.0..=third.1).contains(other)
         })
         .collect();
-    if inner.len() < FEWEST {
+    if inner.len() < MIN_STAMPS {
         return Relation::Unclear;
     }
     #[expect(
@@ -71,7 +71,7 @@ pub(super) fn relation(delays: &[(f64, f64)]) -> Relation {
 fn bounds(delays: &[(f64, f64)], value: fn(&(f64, f64)) -> f64) -> Option<(f64, f64)> {
     let mut sorted: Vec<f64> = delays.iter().map(value).collect();
     sorted.sort_by(f64::total_cmp);
-    let outer = sorted.len() / OUTER;
+    let outer = sorted.len() / TRIMMED_DIVISOR;
     Some((*sorted.get(outer)?, *sorted.iter().rev().nth(outer)?))
 }
 

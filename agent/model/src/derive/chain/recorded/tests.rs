@@ -71,7 +71,7 @@ fn topics_whose_delays_add_up_form_a_chain() {
 }
 
 #[test]
-fn branches_of_one_topic_form_no_chain_even_if_one_always_comes_first() {
+fn branches_of_one_topic_form_no_chain_even_if_one_is_always_first() {
     let chains = recorded(None, |delays| {
         let clean = delays.next(10 * MILLISECOND, 4 * MILLISECOND);
         let map = delays.next(30 * MILLISECOND, 4 * MILLISECOND);
@@ -199,7 +199,7 @@ fn all_tables_are_bounded() {
     }
     assert_eq!(chains.topics.len(), MAX_TOPICS);
     assert_eq!(chains.refused, 11);
-    let mut chains = RecordedChains::with_room(100);
+    let mut chains = RecordedChains::with_limit(100);
     for round in 0..100 {
         let stamp = START + round * 101_000_001 + 1;
         add(&mut chains, "/a", stamp, stamp + MILLISECOND, None);

@@ -77,7 +77,7 @@ impl Step<'_> {
     }
 
     /// Completes the spans of a publication that continues another one.
-    pub(in crate::derive::chain) fn go_on(
+    pub(in crate::derive::chain) fn continue_spans(
         &self,
         before: Traced,
         known: impl Iterator<Item = Traced>,

@@ -25,7 +25,7 @@ use crate::facts::header::stamp_time;
 use crate::facts::identity::Identity;
 
 /// A stamp that is a multiple of this many nanoseconds may also occur on another robot.
-const COARSE: u32 = 1000;
+const COARSE_STAMP_UNIT: u32 = 1000;
 
 /// The messages with one stamp, in the order of their publication.
 pub(in crate::derive::chain) struct Stamped<'a> {
@@ -229,7 +229,7 @@ fn identity(stamp: Stamp, first: &Published) -> u128 {
     identity.add(&seconds.to_be_bytes());
     identity.add(&nanoseconds.to_be_bytes());
     let is_present = stamp_time(stamp, first.published).is_some();
-    if nanoseconds.is_multiple_of(COARSE) || !is_present {
+    if nanoseconds.is_multiple_of(COARSE_STAMP_UNIT) || !is_present {
         identity.add(&key(first));
     }
     identity.bits()

@@ -7,7 +7,7 @@ use ros2probe_wire::transforms::{Pose, Transform};
 use ros2probe_wire::{Guid, SequenceNumber};
 
 use super::{NAME, Origin, without_slash};
-use crate::derive::robot::text::bounded;
+use crate::derive::robot::text::truncated_text;
 use crate::facts::bounded::Bounded;
 use crate::facts::model_time::ModelTime;
 use crate::facts::names::NodeName;
@@ -18,30 +18,30 @@ use crate::facts::tables::EdgeBroadcasters;
 const RATE_SECONDS: usize = 10;
 /// An edge is silent after this time, and after five of its longest intervals.
 const SILENCE: Duration = Duration::from_secs(3);
-const INTERVALS: u32 = 5;
+const SILENT_INTERVALS: u32 = 5;
 /// Two broadcasters are a fault if both broadcast within this time.
-const BOTH: Duration = Duration::from_secs(5);
+const DUPLICATE_BROADCASTER_WINDOW: Duration = Duration::from_secs(5);
 /// Static broadcasters repeat nothing: both are a fault after this time, in which the lease of one
 /// that crashed ends.
-const BOTH_STATIC: Duration = Duration::from_secs(45);
+const STATIC_DUPLICATE_DELAY: Duration = Duration::from_secs(45);
 /// Time for which a stamp that went back is a fault.
-const WENT_BACK: Duration = Duration::from_secs(60);
+const BACKWARD_STAMP_LIFETIME: Duration = Duration::from_secs(60);
 /// Transforms before a jump is recognised.
-const HISTORY: u32 = 10;
+const MIN_HISTORY: u32 = 10;
 /// A jump is at least this many times as long as the longest of the latest steps.
-const JUMP: f64 = 10.0;
+const JUMP_FACTOR: f64 = 10.0;
 /// Number of jumps that are a fault, and the time within which they are. A localisation corrects
 /// itself less often.
-const MANY_JUMPS: usize = 3;
-const JUMPS_WITHIN: Duration = Duration::from_secs(60);
+const MIN_REPEATED_JUMPS: usize = 3;
+const REPEATED_JUMP_WINDOW: Duration = Duration::from_secs(60);
 /// Minimum of a jump in metres and in radians.
-const METRES: f64 = 0.3;
-const RADIANS: f64 = 0.5;
+const MIN_JUMP_METRES: f64 = 0.3;
+const MIN_JUMP_RADIANS: f64 = 0.5;
 
 /// One edge.
 #[derive(Debug, Default)]
 pub(super) struct Edge {
-    last: Option<Last>,
+    last: Option<LastTransform>,
     broadcasters: Bounded<EdgeBroadcasters, Vec<Source>>,
     /// Transforms so far.
     count: u64,
@@ -54,13 +54,13 @@ pub(super) struct Edge {
     steps: Steps,
     jumps: Jumps,
     /// Times of the latest jumps of the pose, the last one last.
-    jumped: [Option<ModelTime>; MANY_JUMPS],
+    jumped: [Option<ModelTime>; MIN_REPEATED_JUMPS],
     went_back: Option<ModelTime>,
 }
 
 /// The last transform.
 #[derive(Clone, Debug)]
-struct Last {
+struct LastTransform {
     parent: Arc<str>,
     stamp: (i32, u32),
     pose: Pose,
@@ -156,7 +156,7 @@ impl Edge {
     ) -> Option<TransformJump> {
         let parent = match &self.last {
             Some(last) if last.parent.as_bytes() == transform.parent => Arc::clone(&last.parent),
-            _ => without_slash(&bounded(transform.parent, NAME)).into(),
+            _ => without_slash(&truncated_text(transform.parent, NAME)).into(),
         };
         self.count += 1;
         if let Some(current) = self.seconds.last_mut() {
@@ -167,7 +167,7 @@ impl Edge {
             // A reader of a reliable topic has received it before the later ones.
             return None;
         }
-        let went_back = self.heard(origin, transform.stamp);
+        let went_back = self.note_broadcaster(origin, transform.stamp);
         let mut jump = None;
         if let Some(last) = self
             .last
@@ -194,7 +194,7 @@ impl Edge {
             Some(TransformJump::Time) => self.jumps.time += 1,
             None => {}
         }
-        self.last = Some(Last {
+        self.last = Some(LastTransform {
             parent,
             stamp: transform.stamp,
             pose: transform.pose,
@@ -205,7 +205,7 @@ impl Edge {
     }
 
     /// Notes the broadcaster. Returns whether its stamp went back.
-    fn heard(&mut self, origin: &Origin<'_>, stamp: (i32, u32)) -> bool {
+    fn note_broadcaster(&mut self, origin: &Origin<'_>, stamp: (i32, u32)) -> bool {
         let place = self
             .broadcasters
             .iter()
@@ -264,14 +264,17 @@ impl Edge {
         if self.has_several(last, now) {
             return Some(TransformFaultKind::SeveralBroadcasters);
         }
-        if self.went_back.is_some_and(|at| now - at < WENT_BACK) {
+        if self
+            .went_back
+            .is_some_and(|at| now - at < BACKWARD_STAMP_LIFETIME)
+        {
             return Some(TransformFaultKind::TimeWentBack);
         }
         let [earliest, ..] = self.jumped;
-        if earliest.is_some_and(|at| now - at < JUMPS_WITHIN) {
+        if earliest.is_some_and(|at| now - at < REPEATED_JUMP_WINDOW) {
             return Some(TransformFaultKind::Jumps);
         }
-        let limit = SILENCE.max(self.interval? * INTERVALS);
+        let limit = SILENCE.max(self.interval? * SILENT_INTERVALS);
         let mut writers = self.broadcasters.iter();
         let is_silent =
             !last.is_static && now - last.at > limit && !writers.any(|each| is_paused(each.writer));
@@ -288,19 +291,22 @@ impl Edge {
     }
 
     /// Returns whether two broadcasters are at work.
-    fn has_several(&self, last: &Last, now: ModelTime) -> bool {
+    fn has_several(&self, last: &LastTransform, now: ModelTime) -> bool {
         let at_work = self
             .broadcasters
             .iter()
             .filter(|each| match last.is_static {
-                true => now - each.since >= BOTH_STATIC,
-                false => now - each.at < BOTH && each.at - each.since >= BOTH,
+                true => now - each.since >= STATIC_DUPLICATE_DELAY,
+                false => {
+                    now - each.at < DUPLICATE_BROADCASTER_WINDOW
+                        && each.at - each.since >= DUPLICATE_BROADCASTER_WINDOW
+                }
             });
         at_work.count() > 1
     }
 
     pub(super) fn facts(&self, child: &Arc<str>, now: ModelTime) -> EdgeFacts {
-        let last = self.last.clone().unwrap_or(Last {
+        let last = self.last.clone().unwrap_or(LastTransform {
             parent: Arc::default(),
             stamp: (0, 0),
             pose: Pose {
@@ -344,10 +350,10 @@ impl Steps {
         if !metres.is_finite() || !radians.is_finite() {
             return None;
         }
-        let is_known = self.count >= HISTORY;
-        let jump = if is_known && metres > METRES && metres > JUMP * self.metres {
+        let is_known = self.count >= MIN_HISTORY;
+        let jump = if is_known && metres > MIN_JUMP_METRES && metres > JUMP_FACTOR * self.metres {
             Some(TransformJump::Translation)
-        } else if is_known && radians > RADIANS && radians > JUMP * self.radians {
+        } else if is_known && radians > MIN_JUMP_RADIANS && radians > JUMP_FACTOR * self.radians {
             Some(TransformJump::Rotation)
         } else {
             None

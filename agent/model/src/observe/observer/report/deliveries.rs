@@ -68,7 +68,7 @@ fn delivery_facts(
     writer: Guid,
     (delivery, routes): (&Delivery, &[&KnownRoute]),
 ) -> DeliveryFacts {
-    let main = delivery.main();
+    let main = delivery.main_route();
     let matched = MatchedReaders::new(&observer.graph, Some(topic), writer);
     let owner = match delivery.receiver() {
         Receiver::Participant(prefix) => Some(prefix),
