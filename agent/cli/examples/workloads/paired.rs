@@ -133,7 +133,7 @@ impl Running {
             peer.wait_matched()?;
         }
         for publisher in &mut publishers {
-            publisher.go()?;
+            publisher.start_sending()?;
         }
         std::thread::sleep(WARM_UP);
         agent.process.terminate()?;
@@ -196,7 +196,7 @@ impl Running {
                 counted >= least,
                 "the agent counted {counted} of {}: {}",
                 stream.topic,
-                page.doubts()
+                page.suspicious_counters()
             );
         }
         agent.process.terminate()?;

@@ -325,7 +325,7 @@ impl Exchange {
                 self.received.sequences("sub").len(),
                 end.counted(),
             );
-            println!("{}", end.scrape.doubted_jumps());
+            println!("{}", end.scrape.suspicious_counters());
         }
     }
 }

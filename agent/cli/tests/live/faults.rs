@@ -197,7 +197,7 @@ impl Counted {
             (counted, lost) == (self.sent as f64, 0.0),
             "{counted} of {} counted, {lost} lost: {}",
             self.sent,
-            page.doubted_jumps()
+            page.suspicious_counters()
         );
         Ok(())
     }

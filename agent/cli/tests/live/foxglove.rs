@@ -275,7 +275,7 @@ fn a_slow_or_killed_viewer_affects_no_other_viewer_and_no_capture() -> Result<()
     ensure!(
         page.sum("ros2_topic_messages_total", &label) == MESSAGES as f64,
         "{}",
-        page.doubted_jumps()
+        page.suspicious_counters()
     );
     ensure!(page.sum("ros2_topic_lost_messages_total", &label) == 0.0);
     let dropped = page.sum("ros2probe_foxglove_dropped_messages_total", &[]);

@@ -106,7 +106,7 @@ fn counted_as_logged(stack: Stack) -> Result<()> {
                 "{stack:?} {} B on {}, {received} received: {}",
                 stream.size,
                 observed.agent.host.name(),
-                page.doubted_jumps()
+                page.suspicious_counters()
             );
             check_no_drops(&page)?;
         }

@@ -85,7 +85,7 @@ fn every_message_is_in_the_bags_or_counted_as_missing() -> Result<()> {
             ensure!(
                 (messages, lost) == (*count as f64, 0.0),
                 "{topic}: {messages} counted, {lost} lost: {}",
-                page.doubted_jumps()
+                page.suspicious_counters()
             );
         }
     }
@@ -148,7 +148,7 @@ fn check_all_or_counted(bag: &Path, report: &Value, pairs: &[Pair], page: &Scrap
             ensure!(
                 all == *count,
                 "{topic}: {report:#}\n{}",
-                page.doubted_jumps()
+                page.suspicious_counters()
             );
         }
         ensure!(recorded.len() as u64 * 2 > *count, "{topic}: {report:#}");
@@ -203,7 +203,7 @@ fn a_slow_reader_loses_the_largest(robot: &Robot<'_>, pairs: &mut [Pair]) -> Res
             ensure!(
                 all == *count,
                 "{topic}: {report:#}\n{}",
-                page.doubted_jumps()
+                page.suspicious_counters()
             );
         }
         // The largest messages are dropped first, so small messages stay complete.

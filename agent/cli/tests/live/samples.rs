@@ -154,7 +154,7 @@ fn check_payloads(
                 Ok(page) => format!(
                     "{stack:?} {size}: after {:?} and {missed} missed: {}",
                     received.keys(),
-                    page.doubted_jumps()
+                    page.suspicious_counters()
                 ),
                 Err(error) => error.to_string(),
             });
@@ -198,13 +198,13 @@ fn check_all_or_counted(
     ensure!(
         missed == 0 || dropped > 0.0,
         "{missed} missed: {}",
-        page.doubted_jumps()
+        page.suspicious_counters()
     );
     ensure!(
         received >= 10,
         "{} of 40: {}",
         received,
-        page.doubted_jumps()
+        page.suspicious_counters()
     );
     let label = [("topic", "/points")];
     let counted = page.sum("ros2_topic_messages_total", &label);
@@ -214,7 +214,7 @@ fn check_all_or_counted(
         ensure!(
             (counted, lost) == (40.0, 0.0),
             "{counted}, {lost}: {}",
-            page.doubted_jumps()
+            page.suspicious_counters()
         );
     }
     Ok(())
@@ -406,7 +406,7 @@ fn stopped_and_killed_readers_delay_no_other_reader() -> Result<()> {
     ensure!(
         page.sum("ros2_topic_messages_total", &label) == 160.0,
         "{}",
-        page.doubted_jumps()
+        page.suspicious_counters()
     );
     ensure!(page.sum("ros2_topic_lost_messages_total", &label) == 0.0);
     let queued = page.sum("ros2probe_queued_bytes", &[]);
@@ -481,7 +481,7 @@ fn the_cost_of_a_stream_of_point_clouds_is_measured() -> Result<()> {
             used.memory.unreclaimable as f64 / 1e6,
             page.sum("ros2_topic_messages_total", &label),
             stream.count,
-            page.doubted_jumps(),
+            page.suspicious_counters(),
         );
     }
     Ok(())

@@ -333,7 +333,7 @@ impl<'n> Robot<'n> {
             }
             if Instant::now() > deadline {
                 let page = self.agent()?.scrape()?;
-                bail!("found {found:#?}\n{}", page.doubted_jumps());
+                bail!("found {found:#?}\n{}", page.suspicious_counters());
             }
             std::thread::sleep(Duration::from_millis(200));
         }

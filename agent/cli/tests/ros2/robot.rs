@@ -213,7 +213,7 @@ fn bag_holds_or_names_each_message(
             "{topic}: {} recorded, {missing} missing and {unseen} unknown of {count}, not named: {:?}: {report:#}\n{}",
             in_bag.len(),
             unnamed(&in_bag, &report, topic, count),
-            page.doubted_jumps()
+            page.suspicious_counters()
         );
         let least = match is_looked_at {
             true if LARGE.contains(&topic) => 0.0,
@@ -223,19 +223,19 @@ fn bag_holds_or_names_each_message(
         ensure!(
             in_bag.len() as f64 >= least,
             "{topic}: {report:#}\n{}",
-            page.doubted_jumps()
+            page.suspicious_counters()
         );
         let counted = page.sum("ros2_topic_messages_total", &[("topic", topic)]);
         ensure!(
             counted == (count - unseen) as f64,
             "{topic}: {counted} counted of {count}: {}",
-            page.doubted_jumps()
+            page.suspicious_counters()
         );
         let lost = page.sum("ros2_topic_lost_messages_total", &[("topic", topic)]);
         ensure!(
             lost == 0.0,
             "{topic}: {lost} lost: {}",
-            page.doubted_jumps()
+            page.suspicious_counters()
         );
     }
     Ok(unknown_of)

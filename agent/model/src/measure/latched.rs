@@ -237,12 +237,12 @@ impl Latched {
         let Some(known) = known.filter(|_| missed.reason == MissedReason::NotCaptured) else {
             return;
         };
-        if matches!(known.last, Last::Kept(..))
+        if matches!(known.last, LastMessage::Kept(..))
             && let Some((newest, source)) = known.newest
             && newest < missed.last
         {
             known.newest = Some((missed.last, source));
-            self.replace(missed.writer, Last::Unseen);
+            self.replace(missed.writer, LastMessage::Unseen);
         }
     }
 

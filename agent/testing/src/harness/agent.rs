@@ -185,7 +185,7 @@ impl Scrape {
     }
 
     /// Returns every counter above zero that could explain a difference.
-    pub fn doubted_jumps(&self) -> String {
+    pub fn suspicious_counters(&self) -> String {
         let telling = [
             "lost",
             "dropped",

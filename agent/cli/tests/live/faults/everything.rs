@@ -408,7 +408,7 @@ impl RealTraffic {
             ensure!(
                 (0.0..=dropped).contains(&missing) && (0.0..=missing).contains(&lost),
                 "{topic}: {counted} of {sent}, {lost} lost, {dropped} dropped: {}",
-                page.doubted_jumps()
+                page.suspicious_counters()
             );
             printed.push(format!("{counted} of {sent} messages of {topic}"));
         }

@@ -183,7 +183,7 @@ pub(super) fn settled(
 pub(super) fn is_exact(page: &Scrape) -> bool {
     let lost = page.sum("ros2probe_records_dropped_total", &[]);
     if lost > 0.0 {
-        eprintln!("too busy to be exact: {}", page.doubted_jumps());
+        eprintln!("too busy to be exact: {}", page.suspicious_counters());
     }
     lost == 0.0
 }

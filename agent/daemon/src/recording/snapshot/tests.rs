@@ -314,7 +314,7 @@ fn reports_of_missing_messages_beyond_their_cap_are_counted() {
     for number in 0..1034 {
         robot.miss(2 * number + 1, 2 * number + 1);
     }
-    assert_eq!(robot.shown().crowded_out, 10);
+    assert_eq!(robot.shown().evicted, 10);
 }
 
 #[test]

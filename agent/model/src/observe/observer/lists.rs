@@ -226,9 +226,13 @@ impl Observer {
                         let topic = published(topic, endpoint);
                         let known = self.measure.profiler.get(guid);
                         let next = known.map_or(SequenceNumber::ZERO, |known| known.writer.next());
-                        self.measure
-                            .payloads
-                            .start_writer(guid, topic, requested, (next, now), is_new);
+                        self.measure.payloads.start_writer(
+                            guid,
+                            topic,
+                            requested,
+                            (next, now),
+                            is_new,
+                        );
                     }
                     _ => self.measure.payloads.release(guid, now),
                 }
