@@ -19,8 +19,8 @@ use super::{Compression, open_file};
 
 /// Maximum length of a record, in bytes; a larger length is damage.
 const MAX_RECORD: u64 = 1 << 30;
-/// Maximum factor by which a file may expand beyond [`Expansion::FREE`]. Recordings stay far below:
-/// a few megabytes of the same byte are rare.
+/// Maximum factor by which a file may expand beyond [`Expansion::FREE_BYTES`]. Recordings stay far
+/// below: a few megabytes of the same byte are rare.
 const EXPANSION_FACTOR: u64 = 1024;
 /// Maximum factor by which one chunk or record may expand, since all of it is in memory.
 const EXPANSION_FACTOR_IN_MEMORY: u64 = 16;

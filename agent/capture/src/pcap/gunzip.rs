@@ -5,8 +5,8 @@ use std::io::{self, Read};
 use flate2::read::MultiGzDecoder;
 use ros2probe_wire::{ExpandsTooFar, Expansion};
 
-/// Maximum factor of expansion beyond [`Expansion::FREE`]. Captures of images of one colour stay
-/// below it; gzip reaches 1032.
+/// Maximum factor of expansion beyond [`Expansion::FREE_BYTES`]. Captures of images of one colour
+/// stay below it; gzip reaches 1032.
 const EXPANSION_FACTOR: u64 = 100;
 
 /// A decompressor that fails when its output exceeds the limit for the compressed bytes so far.

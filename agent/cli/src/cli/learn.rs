@@ -222,9 +222,9 @@ impl Session {
         let learnt = self
             .learner
             .finish()
-            .filter(|learnt| !learnt.lessons.is_empty());
+            .filter(|learnt| !learnt.topics.is_empty());
         let learnt = learnt.ok_or_else(|| nothing("no topic was seen".to_owned()))?;
-        if !learnt.lessons.iter().any(is_expected) {
+        if !learnt.topics.iter().any(is_expected) {
             let seconds = self.learner.seconds();
             let why = format!("{seconds} s were too few to learn any expectation");
             return Err(nothing(why).into());
@@ -245,8 +245,8 @@ impl Session {
     }
 
     fn report(&self, learnt: &Learnt, output: &Destination) {
-        let expected = learnt.lessons.iter().filter(|it| is_expected(it)).count();
-        let all = learnt.lessons.len();
+        let expected = learnt.topics.iter().filter(|it| is_expected(it)).count();
+        let all = learnt.topics.len();
         let seconds = self.learner.seconds();
         eprintln!(
             "rp: expectations for {expected} of {all} topics, learnt in {seconds} s{}",

@@ -3,7 +3,7 @@
 //! This is the only part of the product that sends, and it runs only on request. [`zenoh`] sends to
 //! a router, the other modules to participants of DDS. A bare participant exists for a few
 //! milliseconds. It announces itself by unicast to one running participant at a time, requests its
-//! announcements, and says goodbye. A conversation has at most [`session::MOST_PACKETS`] packets.
+//! announcements, and says goodbye. A conversation has at most [`session::MAX_PACKETS`] packets.
 //! No other participant receives them, no user endpoint is created, and no trace remains.
 
 pub mod announcements;

@@ -49,8 +49,8 @@ pub struct Learner {
 /// Result of learning.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Learnt {
-    /// A lesson for each topic, by name.
-    pub lessons: Vec<TopicThresholds>,
+    /// The thresholds of each topic, by name.
+    pub topics: Vec<TopicThresholds>,
     /// Time of the first and the last view, in Unix seconds.
     pub period: (f64, f64),
     /// Number of topics that no watch can name.
@@ -167,7 +167,7 @@ impl Learner {
         self.period = Some((first, now));
     }
 
-    /// Returns a lesson for each topic. `None` if less than one second was seen.
+    /// Returns the thresholds of each topic. `None` if less than one second was seen.
     #[must_use]
     pub fn finish(&self) -> Option<Learnt> {
         let period = self.period.filter(|_| self.seconds > 0)?;
@@ -177,9 +177,9 @@ impl Learner {
                 .filter(|why| **why == wanted)
                 .count()
         };
-        let lessons = self.topics.iter();
+        let topics = self.topics.iter();
         Some(Learnt {
-            lessons: lessons
+            topics: topics
                 .map(|(name, observation)| thresholds::choose_thresholds(name, observation))
                 .collect(),
             period,

@@ -79,19 +79,19 @@ impl Robot {
         self.view();
     }
 
-    fn lesson(&self) -> TopicThresholds {
-        self.learner.finish().unwrap().lessons.remove(0)
+    fn topic_thresholds(&self) -> TopicThresholds {
+        self.learner.finish().unwrap().topics.remove(0)
     }
 }
 
-fn left_out(lesson: &TopicThresholds, key: &str) -> String {
-    let mut remarks = lesson.remarks.iter();
+fn left_out(topic_thresholds: &TopicThresholds, key: &str) -> String {
+    let mut remarks = topic_thresholds.remarks.iter();
     remarks
         .find_map(|remark| match remark {
             Remark::LeftOut(keys, why) if keys.contains(key) => Some(why.clone()),
             _ => None,
         })
-        .unwrap_or_else(|| panic!("{key} is not left out: {lesson:?}"))
+        .unwrap_or_else(|| panic!("{key} is not left out: {topic_thresholds:?}"))
 }
 
 #[test]
@@ -100,7 +100,7 @@ fn a_steady_topic_has_every_expectation() {
     for _ in 0..60 {
         robot.second(STEADY);
     }
-    let values = robot.lesson().values;
+    let values = robot.topic_thresholds().values;
     assert_eq!(
         (values.min_rate_hz, values.max_rate_hz),
         (Some(8.0), Some(12.0))
@@ -123,7 +123,7 @@ fn an_outlier_moves_no_threshold_and_a_changing_rate_is_left_out() {
             ..STEADY
         });
     }
-    let values = robot.lesson().values;
+    let values = robot.topic_thresholds().values;
     // The slow second violates 8 Hz in no window of 5 s.
     assert_eq!((values.min_rate_hz, values.window_s), (Some(8.0), Some(5)));
     assert_eq!(values.max_latency_ms, Some(6.0));
@@ -134,9 +134,9 @@ fn an_outlier_moves_no_threshold_and_a_changing_rate_is_left_out() {
             ..STEADY
         });
     }
-    let lesson = robot.lesson();
-    assert_eq!(lesson.values.min_rate_hz, Some(8.0));
-    let why = left_out(&lesson, "max_rate_hz");
+    let topic_thresholds = robot.topic_thresholds();
+    assert_eq!(topic_thresholds.values.min_rate_hz, Some(8.0));
+    let why = left_out(&topic_thresholds, "max_rate_hz");
     assert!(
         why.starts_with("the rate varies: 8.6 to 40 Hz in windows of 5 s"),
         "{why}"
@@ -165,12 +165,12 @@ fn a_busy_robot_violates_its_expectations_at_half_its_rate_and_not_otherwise() {
     let learnt = seconds(0, 120, 1);
     let counts = || learnt.iter().map(|second| second.messages);
     assert_eq!((counts().min(), counts().max()), (Some(28), Some(46)));
-    let lesson = thresholds::choose_thresholds("/odom", &Observation::of(learnt.clone()));
-    let values = lesson.values;
+    let topic_thresholds = thresholds::choose_thresholds("/odom", &Observation::of(learnt.clone()));
+    let values = topic_thresholds.values;
     let window = values.window_s.unwrap();
     let low = values.min_rate_hz.unwrap();
     assert!(window > 1 && low > 24.0, "{values:?}");
-    let text = format!("{:?}", lesson.remarks);
+    let text = format!("{:?}", topic_thresholds.remarks);
     assert!(
         text.contains(&format!("in windows of {window} s")),
         "{text}"
@@ -198,10 +198,10 @@ fn a_topic_that_pauses_most_of_the_time_has_no_rate() {
             ..STEADY
         });
     }
-    let lesson = robot.lesson();
-    let why = left_out(&lesson, "min_rate_hz");
+    let topic_thresholds = robot.topic_thresholds();
+    let why = left_out(&topic_thresholds, "min_rate_hz");
     assert_eq!(why, "no message arrived for most of the time");
-    assert_eq!(lesson.values.min_rate_hz, None);
+    assert_eq!(topic_thresholds.values.min_rate_hz, None);
 }
 
 #[test]
@@ -213,9 +213,9 @@ fn rare_messages_lead_to_a_limit_of_silence_only_if_they_are_regular() {
             ..STEADY
         });
     }
-    let lesson = regular.lesson();
-    assert!((27.0..31.0).contains(&lesson.values.max_silence_s.unwrap()));
-    assert!(left_out(&lesson, "min_rate_hz").contains("too seldom"));
+    let topic_thresholds = regular.topic_thresholds();
+    assert!((27.0..31.0).contains(&topic_thresholds.values.max_silence_s.unwrap()));
+    assert!(left_out(&topic_thresholds, "min_rate_hz").contains("too seldom"));
 
     let mut irregular = Robot::new(&["/goal"]);
     for second in 0..200 {
@@ -224,7 +224,7 @@ fn rare_messages_lead_to_a_limit_of_silence_only_if_they_are_regular() {
             ..STEADY
         });
     }
-    assert!(left_out(&irregular.lesson(), "max_silence_s").contains("too irregular"));
+    assert!(left_out(&irregular.topic_thresholds(), "max_silence_s").contains("too irregular"));
 }
 
 #[test]
@@ -235,14 +235,14 @@ fn values_that_cannot_be_learnt_are_explained() {
         let counted = robot.topics[0].measurement.as_mut().unwrap();
         counted.negative_latency_messages += 1;
     }
-    assert!(left_out(&robot.lesson(), "max_latency_ms").ends_with("the clocks differ"));
+    assert!(left_out(&robot.topic_thresholds(), "max_latency_ms").ends_with("the clocks differ"));
     robot.topics[0].subscriptions.clear();
     for _ in 0..90 {
         robot.second(STEADY);
     }
-    let lesson = robot.lesson();
+    let topic_thresholds = robot.topic_thresholds();
     assert_eq!(
-        left_out(&lesson, "subscribers"),
+        left_out(&topic_thresholds, "subscribers"),
         "the number varies: 0 to 2"
     );
     let mut silent = Robot::new(&["/imu"]);
@@ -252,10 +252,13 @@ fn values_that_cannot_be_learnt_are_explained() {
             ..STEADY
         });
     }
-    let lesson = silent.lesson();
-    assert_eq!(left_out(&lesson, "silence"), "no message was seen");
+    let topic_thresholds = silent.topic_thresholds();
     assert_eq!(
-        left_out(&lesson, "publishers"),
+        left_out(&topic_thresholds, "silence"),
+        "no message was seen"
+    );
+    assert_eq!(
+        left_out(&topic_thresholds, "publishers"),
         "5 s with a publisher are too few"
     );
 }
@@ -304,7 +307,7 @@ fn views_too_close_or_too_far_apart_count_whole_seconds() {
         ..STEADY
     });
     assert_eq!(robot.learner.seconds(), 33);
-    assert_eq!(robot.lesson().values.min_rate_hz, Some(8.0));
+    assert_eq!(robot.topic_thresholds().values.min_rate_hz, Some(8.0));
 }
 
 #[test]
@@ -314,7 +317,7 @@ fn hostile_names_of_topics_do_not_corrupt_the_file() {
         robot.second(STEADY);
     }
     let learnt = robot.learner.finish().unwrap();
-    assert_eq!((learnt.lessons.len(), learnt.unnamed), (2, 1));
+    assert_eq!((learnt.topics.len(), learnt.unnamed), (2, 1));
     let source = Source {
         place: "robot\n- 1",
         domain_id: 3,
@@ -327,7 +330,7 @@ fn hostile_names_of_topics_do_not_corrupt_the_file() {
     assert_eq!(config.watches.len(), 2, "{file}");
     assert_eq!(
         config.watches[0].expectations.values(),
-        learnt.lessons[0].values
+        learnt.topics[0].values
     );
 }
 
@@ -338,16 +341,16 @@ fn a_file_is_never_larger_than_an_agent_reads() {
         robot.second(STEADY);
     }
     let mut learnt = robot.learner.finish().unwrap();
-    let lesson = learnt.lessons.remove(0);
-    learnt.lessons = (0..Limit::Watches.row().default)
+    let topic_thresholds = learnt.topics.remove(0);
+    learnt.topics = (0..Limit::Watches.row().default)
         .map(|number| TopicThresholds {
             topic: format!("/t{number}{}", "x".repeat(250)),
             remarks: [
-                &lesson.remarks[..],
+                &topic_thresholds.remarks[..],
                 &vec![Remark::LeftOut("all", "y".repeat(900)); 1],
             ]
             .concat(),
-            ..lesson.clone()
+            ..topic_thresholds.clone()
         })
         .collect();
     let source = Source {
@@ -358,7 +361,7 @@ fn a_file_is_never_larger_than_an_agent_reads() {
         seconds: 30,
     };
     let config = Config::parse(text(&learnt, &source).as_bytes()).unwrap();
-    assert_eq!(config.watches.len(), learnt.lessons.len());
+    assert_eq!(config.watches.len(), learnt.topics.len());
 }
 
 proptest! {
@@ -376,8 +379,8 @@ proptest! {
                 silence: last, publishers, subscriptions,
             });
         }
-        let lesson = thresholds::choose_thresholds("/x", &Observation::of(list.clone()));
-        let expectations = lesson.values.try_into().unwrap();
+        let topic_thresholds = thresholds::choose_thresholds("/x", &Observation::of(list.clone()));
+        let expectations = topic_thresholds.values.try_into().unwrap();
         prop_assert_eq!(rehearsal::violations(&expectations, &list), Vec::<&str>::new());
     }
 
@@ -395,11 +398,11 @@ proptest! {
                 subscriptions: 1, ..Second::default()
             }).collect()
         };
-        let lesson = thresholds::choose_thresholds("/x", &Observation::of(make(1.0)));
-        if lesson.values.min_rate_hz.is_some() {
-            let expectations = lesson.values.try_into().unwrap();
+        let topic_thresholds = thresholds::choose_thresholds("/x", &Observation::of(make(1.0)));
+        if topic_thresholds.values.min_rate_hz.is_some() {
+            let expectations = topic_thresholds.values.try_into().unwrap();
             let violated = rehearsal::violations(&expectations, &make(0.5));
-            prop_assert!(violated.contains(&"min_rate_hz"), "{:?}: {violated:?}", lesson.values);
+            prop_assert!(violated.contains(&"min_rate_hz"), "{:?}: {violated:?}", topic_thresholds.values);
         }
     }
 }

@@ -45,12 +45,16 @@ pub fn text(learnt: &Learnt, source: &Source<'_>) -> String {
 fn entries(learnt: &Learnt, source: &Source<'_>, is_explained: bool) -> String {
     let mut text = head(source);
     text.push_str("version: 1\nwatch:");
-    if learnt.lessons.iter().all(|lesson| !is_expected(lesson)) {
+    if learnt
+        .topics
+        .iter()
+        .all(|topic_thresholds| !is_expected(topic_thresholds))
+    {
         text.push_str(" []");
     }
     text.push('\n');
-    for lesson in &learnt.lessons {
-        entry(&mut text, lesson, source, is_explained);
+    for topic_thresholds in &learnt.topics {
+        entry(&mut text, topic_thresholds, source, is_explained);
     }
     if learnt.unnamed > 0 {
         let count = learnt.unnamed;
@@ -105,8 +109,8 @@ pub fn parameters(known: &Parameters<'_>, domain_id: u32) -> String {
 
 /// Returns whether a topic has any expectation.
 #[must_use]
-pub fn is_expected(lesson: &TopicThresholds) -> bool {
-    let mut remarks = lesson.remarks.iter();
+pub fn is_expected(topic_thresholds: &TopicThresholds) -> bool {
+    let mut remarks = topic_thresholds.remarks.iter();
     remarks.any(|remark| matches!(remark, Remark::Set(..)))
 }
 
@@ -140,9 +144,14 @@ fn head(source: &Source<'_>) -> String {
     )
 }
 
-fn entry(text: &mut String, lesson: &TopicThresholds, source: &Source<'_>, is_explained: bool) {
-    let name = &lesson.topic;
-    if is_expected(lesson) {
+fn entry(
+    text: &mut String,
+    topic_thresholds: &TopicThresholds,
+    source: &Source<'_>,
+    is_explained: bool,
+) {
+    let name = &topic_thresholds.topic;
+    if is_expected(topic_thresholds) {
         line(text, &format!("  - topic: {name}"));
         if source.names_domain {
             line(text, &format!("    domain: {}", source.domain_id));
@@ -150,7 +159,7 @@ fn entry(text: &mut String, lesson: &TopicThresholds, source: &Source<'_>, is_ex
     } else if is_explained {
         line(text, &format!("  # {name} has no expectations:"));
     }
-    for remark in &lesson.remarks {
+    for remark in &topic_thresholds.remarks {
         match remark {
             Remark::Set(key, value, why) if why.is_empty() || !is_explained => {
                 line(text, &format!("    {key}: {value}"));

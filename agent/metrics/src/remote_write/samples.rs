@@ -18,7 +18,7 @@ pub(super) const TEXT_END: u8 = 0xff;
 pub(super) const STALE_NAN: f64 = f64::from_bits(0x7ff0_0000_0000_0002);
 
 /// A series: the type of its metric as one byte, its name, and names and values of its labels.
-/// [`END`] ends each text.
+/// [`TEXT_END`] ends each text.
 pub(super) type Key = Arc<[u8]>;
 
 /// The samples of one moment.

@@ -56,7 +56,8 @@ pub struct Stream {
     pub logged: bool,
     /// Seconds for which a publisher stays after its last sample, unless it is terminated.
     pub linger: f64,
-    /// Number of samples after which a publisher waits for [`Peer::go`], repeatedly; 0 = never.
+    /// Number of samples after which a publisher waits for [`Peer::start_sending`], repeatedly; 0 =
+    /// never.
     pub stretch: u64,
     /// Number of peers of the other role for which a peer waits.
     pub peers: usize,
@@ -187,8 +188,8 @@ pub fn pair(
 }
 
 impl Peer {
-    /// Starts a peer and waits until its endpoints exist. A publisher waits for [`Peer::go`] before
-    /// it sends.
+    /// Starts a peer and waits until its endpoints exist. A publisher waits for
+    /// [`Peer::start_sending`] before it sends.
     pub fn start(
         host: &Namespace,
         stack: Stack,

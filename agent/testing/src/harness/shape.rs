@@ -94,8 +94,8 @@ impl Library {
 }
 
 impl Shape {
-    /// Starts a peer and waits until its endpoint exists. A publisher waits for [`Self::go`] before
-    /// it sends.
+    /// Starts a peer and waits until its endpoint exists. A publisher waits for
+    /// [`Self::start_sending`] before it sends.
     pub fn start(host: &Namespace, library: Library, role: Role, options: &str) -> Result<Shape> {
         let directory = tempfile::tempdir().context("cannot create a directory for the log")?;
         let (program, words) = library.command()?;

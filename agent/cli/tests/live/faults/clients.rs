@@ -49,7 +49,7 @@ pub(super) struct Answers {
 }
 
 impl AgentAddresses {
-    /// Returns the doors of an agent on a host. Clients connect on that host.
+    /// Returns the addresses of an agent on a host. Clients connect on that host.
     pub(super) fn new(host: &Namespace, socket: &Path, token: &'static str) -> AgentAddresses {
         AgentAddresses {
             network: host.network(),

@@ -2,10 +2,10 @@
 //! period, callbacks that wait, messages overwritten in their queue.
 //!
 //! A rule is evaluated at each report, on the window of the last 5 to 10 s. A finding appears after
-//! [`BAD`] bad evaluations in a row and ends after [`EVALUATIONS_TO_CLEAR`] good ones. Handles are
-//! not evaluated in their first [`STARTUP_GRACE`], because nodes load and connect when they start.
-//! A finding keeps its value until the value grows by half, so that it does not cause an event per
-//! second.
+//! [`EVALUATIONS_TO_RAISE`] bad evaluations in a row and ends after [`EVALUATIONS_TO_CLEAR`] good
+//! ones. Handles are not evaluated in their first [`STARTUP_GRACE`], because nodes load and connect
+//! when they start. A finding keeps its value until the value grows by half, so that it does not
+//! cause an event per second.
 
 use std::time::Duration;
 
