@@ -81,7 +81,7 @@ impl Processes {
 
     /// Creates a set with one process.
     #[cfg(test)]
-    pub(super) fn of(process: u32, use_of_it: Use) -> Self {
+    pub(crate) fn of(process: u32, use_of_it: Use) -> Self {
         let known = Process {
             met: 1,
             use_of_it,
