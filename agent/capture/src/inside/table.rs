@@ -77,7 +77,10 @@ struct Observed {
     /// Whether the process had ended before it was inspected. Another process may have its id by
     /// now.
     had_ended: bool,
-    domain: DomainId,
+    /// Domain of its environment; `None` until the broker has answered.
+    domain: Option<DomainId>,
+    /// Number of requests for it that failed.
+    failed_requests: u32,
     names: Names,
     new_nodes: Bounded<NewNodes, Vec<NodeName>>,
     /// Number of calls at the last evaluation.
@@ -93,6 +96,16 @@ struct Observed {
 type Mark = [u64; 5];
 
 impl Observed {
+    /// Asks the broker for the domain, and returns whether it answered. The environment of a process
+    /// that cannot be read has domain 0.
+    fn find_domain(&mut self, process: u32, broker: &mut Broker) -> bool {
+        match broker.domain(process) {
+            Ok(domain) => self.domain = Some(DomainId(domain.unwrap_or_default())),
+            Err(_) => self.failed_requests = self.failed_requests.saturating_add(1),
+        }
+        self.domain.is_some()
+    }
+
     fn buffer(&self, address: u64) -> Option<Endpoint> {
         let publisher = self.buffers.get(&address).copied();
         self.names.buffer(address, publisher.unwrap_or_default())
@@ -199,20 +212,36 @@ impl ProcessTable {
     /// number of processes.
     fn observe(&mut self, process: u32, broker: &mut Broker) -> &mut Observed {
         self.known.entry(process).or_insert_with(|| {
-            // Without an answer, the process has no name, and its domain is assumed to be 0.
+            // Without an answer, the process has no name, and its domain is assumed to be 0 until a
+            // later round.
             let states = broker.activities(&[process]);
             let had_ended = states.as_ref().is_ok_and(Vec::is_empty);
             let state = states.unwrap_or_default().into_iter().next();
-            let domain = state
-                .is_some()
-                .then(|| broker.domain(process).ok().flatten());
-            Observed {
-                domain: DomainId(domain.flatten().unwrap_or_default()),
+            let mut observed = Observed {
                 stat: state.map(Stat::from),
                 had_ended,
                 ..Observed::default()
+            };
+            if observed.stat.is_some() {
+                observed.find_domain(process, broker);
             }
+            observed
         })
+    }
+
+    /// Asks again for the domains of running processes, until the broker does not answer. Processes
+    /// with the fewest failed requests come first, because a request may take half a second.
+    fn find_domains(&mut self, running: &HashMap<u32, Stat>, broker: &mut Broker) {
+        let unknown = self.known.iter_mut().filter(|(id, observed)| {
+            observed.domain.is_none() && !observed.had_ended && running.contains_key(id)
+        });
+        let mut unknown: Vec<_> = unknown.collect();
+        unknown.sort_by_key(|(_, observed)| observed.failed_requests);
+        for (id, observed) in unknown {
+            if !observed.find_domain(*id, broker) {
+                return;
+            }
+        }
     }
 
     /// Makes the next round report everything again, after [`Tables::forget_calls`].
@@ -291,6 +320,9 @@ impl ProcessTable {
                 .map(|state| (state.process, state.into()));
             states.collect::<HashMap<u32, Stat>>()
         });
+        if let Some(running) = &states {
+            self.find_domains(running, broker);
+        }
         for (id, process) in &processes {
             if process.state == state::OUTSIDE {
                 if self.rounds.is_multiple_of(RECHECK) {
@@ -386,8 +418,8 @@ impl ProcessTable {
         ProcessReport {
             id,
             name: stat.map(|stat| Arc::clone(&stat.name)),
-            domain_id: observed.domain,
-            cpu: stat.map(|stat| stat.cpu).unwrap_or_default(),
+            domain_id: observed.domain.unwrap_or_default(),
+            cpu: stat.map(|stat| stat.cpu),
             hits: process.hits,
             refused: process.refused,
             is_suspended: observed.is_suspended,
@@ -613,7 +645,7 @@ impl ProcessTable {
             _ => return None,
         };
         Some(CausalPublication {
-            domain_id: observed.domain,
+            domain_id: observed.domain.unwrap_or_default(),
             process: hop.process,
             node: output.node.or(input.node),
             input: TopicName::from(&*input.name),

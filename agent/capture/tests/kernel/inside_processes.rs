@@ -80,6 +80,10 @@ impl Robot {
 
     /// Reads the tables as if this time had passed since the last round.
     fn round_after(&mut self, elapsed: Duration) -> Round {
+        self.round_with(&mut Broker::here(), elapsed)
+    }
+
+    fn round_with(&mut self, broker: &mut Broker, elapsed: Duration) -> Round {
         let shows = self
             .attached
             .as_ref()
@@ -90,7 +94,7 @@ impl Robot {
             &mut self.tables,
             &clocks,
             elapsed,
-            &mut Broker::here(),
+            broker,
             |_| shows,
             |call| deliveries?.of(call),
         )
@@ -199,6 +203,22 @@ fn messages_of_a_process_older_than_the_probes_are_counted_and_named() {
         let again = robot.report(&process);
         assert!(again.publishers.is_empty() && again.subscriptions.is_empty());
     }
+}
+
+#[test]
+fn a_process_has_its_domain_and_name_once_the_broker_answers() {
+    let mut robot = Robot::new(248, &[], false);
+    robot.attach();
+    let mut process = robot.start();
+    process.run("publish 5");
+    let mut absent = Broker::at(Path::new("/nonexistent/broker.sock"));
+    let reports = robot.round_with(&mut absent, Duration::from_secs(1)).report;
+    let report = &reports.processes[0];
+    assert_eq!((report.domain_id.0, &report.name), (0, &None));
+    assert_eq!(report.cpu, None);
+    let report = robot.report(&process);
+    assert_eq!(report.domain_id.0, 7);
+    assert!(report.cpu.is_some() && report.name.is_some());
 }
 
 #[test]

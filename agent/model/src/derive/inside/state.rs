@@ -71,9 +71,9 @@ pub(super) struct Process {
     reported_domain_id: DomainId,
     /// Nodes that it created while it was observed.
     reported: Bounded<ReportedNodes, Vec<NodeName>>,
-    cpu: Duration,
+    cpu: Option<Duration>,
     /// The earlier and the later start of a window: time, CPU time and calls.
-    marks: [(ModelTime, Duration, u64); 2],
+    marks: [(ModelTime, Option<Duration>, u64); 2],
     pub(super) handles: Bounded<InsideHandles, BTreeMap<(Kind, u64), Tracked>>,
     /// Queues of its subscriptions.
     pub(super) queues: BTreeMap<(DomainId, TopicName), ReaderQueue>,
@@ -322,8 +322,11 @@ impl Inside {
         facts.refused = report.refused;
         facts.is_suspended = report.is_suspended;
         facts.shows_intra_process |= report.shows_intra_process;
-        process.cpu = report.cpu;
-        process.reported_domain_id = report.domain_id;
+        process.cpu = report.cpu.or(process.cpu);
+        if process.reported_domain_id != report.domain_id {
+            process.reported_domain_id = report.domain_id;
+            self.graph = None;
+        }
         for node in report.nodes {
             if !process.reported.contains(&node) && process.reported.push(node).is_none() {
                 self.graph = None;
@@ -630,7 +633,9 @@ impl Process {
         let [(begin, cpu, calls), (middle, ..)] = self.marks;
         let span = (at - begin).as_secs_f64();
         if span > 0.0 {
-            self.facts.cpu = Some(self.cpu.saturating_sub(cpu).as_secs_f64() / span);
+            let both = self.cpu.zip(cpu);
+            let spent = both.map(|(end, begin)| end.saturating_sub(begin).as_secs_f64());
+            self.facts.cpu = spent.map(|spent| spent / span);
             let hits = self.facts.calls.saturating_sub(calls);
             self.facts.calls_hz = ratio(hits, 1).map(|hits| hits / span);
         }
