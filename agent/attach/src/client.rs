@@ -318,8 +318,12 @@ impl Broker {
         }
     }
 
-    /// Drops a connection that has failed, and returns the error.
+    /// Drops a connection that has failed, and returns the error. A child has only one connection,
+    /// which therefore stays after a timeout: later requests skip the late answer.
     fn lost(&mut self, error: io::Error) -> BrokerError {
+        if matches!(self.reach, Reach::Child(_)) && error.kind() == io::ErrorKind::WouldBlock {
+            return BrokerError::Answer(error);
+        }
         self.socket = None;
         match self.reach {
             Reach::Child(_) => BrokerError::Ended,
@@ -440,4 +444,75 @@ fn bounded(socket: &OwnedFd) -> io::Result<()> {
         set_socket_timeout(socket, timeout, Some(ANSWERS_WITHIN))?;
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::thread;
+
+    use super::*;
+
+    /// Returns a client of a child that answers nothing, and the child's end of the connection.
+    fn child() -> (Broker, OwnedFd) {
+        let (own, other) = pair().unwrap();
+        let short = Some(Duration::from_millis(200));
+        set_socket_timeout(&own, Timeout::Recv, short).unwrap();
+        let child = Command::new("true").spawn().unwrap();
+        let broker = Broker {
+            reach: Reach::Child(child),
+            socket: Some(own),
+            failed: None,
+            number: 0,
+        };
+        (broker, other)
+    }
+
+    fn reply(socket: &OwnedFd, number: u64, content: Answer) {
+        let answer = Numbered { number, content };
+        send(socket.as_fd(), &answer, &[], SendFlags::empty()).unwrap();
+    }
+
+    #[test]
+    fn a_broker_that_answers_too_late_once_is_asked_again() {
+        let (mut broker, other) = child();
+        let late = broker.processes();
+        assert!(matches!(late, Err(BrokerError::Answer(_))), "{late:?}");
+        reply(&other, 1, Answer::Processes(vec![1]));
+        reply(&other, 1, Answer::End);
+        reply(&other, 2, Answer::Processes(vec![2]));
+        reply(&other, 2, Answer::End);
+        assert_eq!(broker.processes().unwrap(), [2]);
+        drop(other);
+        let ended = broker.processes();
+        assert!(matches!(ended, Err(BrokerError::Ended)), "{ended:?}");
+    }
+
+    #[test]
+    fn a_signal_does_not_end_the_wait_for_an_answer() {
+        extern "C" fn ignore(_: libc::c_int) {}
+        let handler = ignore as extern "C" fn(libc::c_int);
+        // SAFETY: the handler does nothing, and the action is zeroed apart from it.
+        unsafe {
+            let mut action: libc::sigaction = std::mem::zeroed();
+            action.sa_sigaction = handler as libc::sighandler_t;
+            assert_eq!(
+                libc::sigaction(libc::SIGUSR1, &raw const action, std::ptr::null_mut()),
+                0
+            );
+        }
+        let (mut broker, other) = child();
+        // SAFETY: no preconditions.
+        let waiting = unsafe { libc::pthread_self() };
+        let interrupter = thread::spawn(move || {
+            for _ in 0..10 {
+                thread::sleep(Duration::from_millis(10));
+                // SAFETY: the thread waits for this one below.
+                unsafe { libc::pthread_kill(waiting, libc::SIGUSR1) };
+            }
+            reply(&other, 1, Answer::End);
+            other
+        });
+        assert_eq!(broker.processes().unwrap(), []);
+        drop(interrupter.join());
+    }
 }
