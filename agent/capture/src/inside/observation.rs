@@ -187,6 +187,10 @@ impl Observation {
         }
         if self.suspended_at.is_some_and(|at| now - at >= PAUSE) {
             self.suspended_at = None;
+            if let Err(error) = self.tables.forget_times(None) {
+                let reason = in_words(&error);
+                tracing::warn!(reason, "the next calls may seem to have lasted for the pause");
+            }
             tracing::info!("attached again inside processes");
         }
         // A late round is skipped, so the observation ends only when its last round can be reported.

@@ -447,7 +447,11 @@ impl ProcessTable {
             true => state::SUSPENDED,
             false => state::COUNTED,
         };
-        let changed = tables.set_process(id, Process { state, ..*process });
+        let changed = match is_suspended {
+            true => Ok(()),
+            false => tables.forget_times(Some(id)),
+        };
+        let changed = changed.and_then(|()| tables.set_process(id, Process { state, ..*process }));
         if changed.is_ok() {
             observed.is_suspended = is_suspended;
             tracing::info!(

@@ -18,7 +18,7 @@ use ros2probe_capture::filter::Deliveries;
 use ros2probe_capture::inside::programs::{self, Attached, Events, Programs, Tables};
 use ros2probe_capture::inside::table::{MAX_PROCESS_HITS, ProcessTable, Round};
 use ros2probe_capture::system::Clocks;
-use ros2probe_model::facts::calls::report::{ProcessReport, Trigger};
+use ros2probe_model::facts::calls::report::{Durations, ProcessReport, Trigger};
 use ros2probe_testing::harness::traced_program::TracedProgram;
 use ros2probe_wire::inside::{Counter, HANDLE_CAPACITY, HOPS_PER_SECOND};
 
@@ -545,6 +545,37 @@ fn a_process_beyond_its_budget_is_no_longer_counted_until_it_slows_down() {
         robot.report(&process).publishers[0].published,
         MAX_PROCESS_HITS + 6
     );
+}
+
+#[test]
+fn no_call_or_interval_after_a_suspension_includes_it() {
+    let mut robot = Robot::new(248, &[], true);
+    robot.attach();
+    let mut process = robot.start();
+    process.run("init");
+    process.run("take 1");
+    process.run(&format!("publish {}", MAX_PROCESS_HITS + 1));
+    // One callback begins before the suspension, and the next one during it.
+    let pause = Duration::from_millis(150);
+    for is_suspended in [true, false] {
+        process.begin("take 1 300000");
+        std::thread::sleep(pause);
+        assert_eq!(robot.report(&process).is_suspended, is_suspended);
+        process.end("take");
+        if is_suspended {
+            std::thread::sleep(2 * pause);
+        }
+    }
+    process.run("take 1");
+    let report = robot.report(&process);
+    let callback = &report.callbacks[0];
+    let longest = |durations: &Durations| durations.range().unwrap().1;
+    assert_eq!(callback.calls, 2, "the other two were not observed whole");
+    assert!(longest(&callback.durations) < pause, "{callback:?}");
+    let publisher = &report.publishers[0];
+    assert!(longest(&publisher.intervals) < 3 * pause, "{publisher:?}");
+    let subscription = &report.subscriptions[0];
+    assert!(longest(&subscription.intervals) < 3 * pause);
 }
 
 #[test]
