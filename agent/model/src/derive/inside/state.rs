@@ -20,7 +20,6 @@ use crate::facts::calls::facts::{
     InsideFacts, LifecycleState, NewLateCalls, ObservedProcess, TopicInside,
 };
 use crate::facts::calls::late::LateCall;
-use crate::facts::calls::other_thread::OtherThread;
 use crate::facts::calls::report::{ProcessReport, Report, ThreadStates, Transition, Trigger};
 use crate::facts::diagnosis::Diagnosis;
 use crate::facts::measurement::Measurement;
@@ -606,8 +605,6 @@ impl Inside {
     fn late_finding(&self, late: &Late<'_>) -> Diagnosis {
         let name = late.trigger.name().map(TopicName::from);
         let topic = name.and_then(|name| self.topics.get(late.owner.domain_id, &name));
-        let call = &late.example.call;
-        let by = late.example.main.and_then(|part| call.named_by(part));
         Diagnosis::LateCallback {
             topic: topic.map(|topic| topic.key(late.owner.domain_id)),
             callback: late.owner.clone(),
@@ -615,8 +612,8 @@ impl Inside {
             calls: late.calls,
             stage: late.stage,
             cause: late.cause,
-            by: by.map(OtherThread::culprit),
-            longest: call.total(),
+            by: late.longest.culprit.clone(),
+            longest: late.longest.total,
         }
     }
 
