@@ -295,6 +295,9 @@ impl Observation {
         }
         self.wait(shared, now + EVERY);
         self.set_clocks();
+        let elapsed = self.last_round.elapsed();
+        self.last_round += elapsed;
+        (self.table).apply_budgets(&mut self.tables, elapsed, &mut self.broker);
         (self.table).drain(&mut self.tables, &Clocks::read(), &mut self.broker);
         self.broker.rest();
     }

@@ -39,6 +39,9 @@ use crate::tables::{
 pub const MAX_PROCESS_HITS: u64 = 50_000;
 /// Minimum time over which calls per second are evaluated: a shorter time may contain only a burst.
 const JUDGED_OVER: Duration = Duration::from_millis(500);
+/// Number of items of the announcement ring that are read together: twice as many as fit into it.
+/// A process that announces without end must not keep the thread from applying its budget.
+const DRAINED: usize = 10_000;
 /// Number of rounds after which a process outside of the control group is inspected again.
 const RECHECK: u32 = 5;
 
@@ -170,9 +173,20 @@ impl ProcessTable {
         self.known.is_empty()
     }
 
-    /// Reads the waiting announcements. `broker` provides facts about the processes.
+    /// Reads the waiting announcements, but not all that processes make meanwhile. `broker` provides
+    /// facts about the processes.
     pub fn drain(&mut self, tables: &mut Tables, clocks: &Clocks, broker: &mut Broker) {
-        while let Some(item) = tables.next_announcement(Item::read) {
+        let items = std::iter::from_fn(|| tables.next_announcement(Item::read));
+        self.note_all(items, clocks, broker);
+    }
+
+    fn note_all(
+        &mut self,
+        items: impl Iterator<Item = Option<Item>>,
+        clocks: &Clocks,
+        broker: &mut Broker,
+    ) {
+        for item in items.take(DRAINED) {
             self.note(item, clocks, broker);
         }
     }
@@ -193,6 +207,10 @@ impl ProcessTable {
     fn announced(&mut self, announcement: &Announcement, clocks: &Clocks, broker: &mut Broker) {
         let observed = self.observe(announcement.process, broker);
         if announcement.kind == announced::TRANSITION {
+            if self.transitions.is_full() {
+                self.transitions.refuse();
+                return;
+            }
             let transition = Transition {
                 process: announcement.process,
                 node: observed.names.machine(announcement.address),
@@ -299,11 +317,9 @@ impl ProcessTable {
         delivery: impl Fn(&late::LateCall) -> Option<MessageDelivery>,
     ) -> Round {
         self.rounds = self.rounds.wrapping_add(1);
-        self.unjudged += elapsed;
-        let is_due = self.unjudged >= JUDGED_OVER;
-        let judged = is_due.then(|| std::mem::take(&mut self.unjudged));
+        let hits = self.apply_budgets(tables, elapsed, broker);
         self.drain(tables, clocks, broker);
-        let (mut reports, mut hits) = (HashMap::new(), 0);
+        let mut reports = HashMap::new();
         let processes: Vec<_> = tables.processes().collect();
         let counted = processes
             .iter()
@@ -329,9 +345,6 @@ impl ProcessTable {
                     let _ = tables.remove_process(*id);
                 }
                 continue;
-            }
-            if let Some(over) = judged {
-                hits += self.judge(tables, *id, process, over);
             }
             let report = self.process(*id, process, states.as_ref());
             reports.insert(*id, report);
@@ -427,6 +440,30 @@ impl ProcessTable {
             nodes: observed.new_nodes.take(),
             ..ProcessReport::default()
         }
+    }
+
+    /// Applies the budget of each process, before its announcements are read. `elapsed`: time since
+    /// the last call. Returns the calls per second of all processes; 0 if they were not evaluated.
+    pub fn apply_budgets(
+        &mut self,
+        tables: &mut Tables,
+        elapsed: Duration,
+        broker: &mut Broker,
+    ) -> u64 {
+        self.unjudged += elapsed;
+        if self.unjudged < JUDGED_OVER {
+            return 0;
+        }
+        let over = std::mem::take(&mut self.unjudged);
+        let processes: Vec<_> = tables.processes().collect();
+        let counted = processes
+            .iter()
+            .filter(|(_, process)| process.state != state::OUTSIDE);
+        let hits = counted.map(|(id, process)| {
+            self.observe(*id, broker);
+            self.judge(tables, *id, process, over)
+        });
+        hits.sum()
     }
 
     /// Applies the budget of a process to its calls over this time. Returns its calls per second.
@@ -737,6 +774,18 @@ mod tests {
         assert_driven::<NewNodes>();
         assert_driven::<Transitions>();
         assert_eq!(table.transitions.len(), Transitions::CAP);
+    }
+
+    #[test]
+    fn announcements_without_end_are_read_in_parts() {
+        let (mut table, clocks) = (table(), Clocks::read());
+        let mut read = 0;
+        let endless = std::iter::repeat_with(|| {
+            read += 1;
+            Some(Item::Hop(inside::Hop::new_zeroed()))
+        });
+        table.note_all(endless, &clocks, &mut Broker::here());
+        assert_eq!(read, DRAINED);
     }
 
     #[test]

@@ -548,6 +548,21 @@ fn a_process_beyond_its_budget_is_no_longer_counted_until_it_slows_down() {
 }
 
 #[test]
+fn the_budget_applies_before_announcements_are_read() {
+    let mut robot = Robot::new(248, &[], true);
+    robot.attach();
+    let mut process = robot.start();
+    let over = Duration::from_millis(500);
+    process.run(&format!("publish {}", MAX_PROCESS_HITS));
+    let tables = &mut robot.tables;
+    let hits = (robot.table).apply_budgets(tables, over, &mut Broker::here());
+    assert!(hits >= 2 * MAX_PROCESS_HITS, "{hits}");
+    process.run("transition");
+    assert_eq!(robot.counter(Counter::Suspended), 1);
+    assert!(robot.round().report.transitions.is_empty());
+}
+
+#[test]
 fn no_call_or_interval_after_a_suspension_includes_it() {
     let mut robot = Robot::new(248, &[], true);
     robot.attach();
