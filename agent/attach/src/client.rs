@@ -5,6 +5,7 @@ use std::os::fd::{AsFd as _, BorrowedFd, OwnedFd};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use rustix::net::sockopt::{Timeout, set_socket_timeout};
@@ -12,6 +13,7 @@ use rustix::net::{
     AddressFamily, SendFlags, SocketAddrUnix, SocketFlags, SocketType, connect, socket_with,
     socketpair,
 };
+use tracing::level_filters::LevelFilter;
 
 use crate::functions::{Calls, Library};
 use crate::mapped::Use;
@@ -24,6 +26,8 @@ use crate::server::answer::answer;
 pub const COMMAND: &str = "attach";
 /// Whether this program has [`COMMAND`].
 static HAS_COMMAND: AtomicBool = AtomicBool::new(false);
+/// Level of the log of a broker that this process starts; `None`: the broker has its own default.
+static LOG_LEVEL: Mutex<Option<LevelFilter>> = Mutex::new(None);
 /// Maximum time to wait for an answer. The broker itself gives up earlier.
 const ANSWERS_WITHIN: Duration = PATIENCE.saturating_add(Duration::from_secs(1));
 /// Pause before another attempt to connect.
@@ -33,6 +37,12 @@ const RETRY: Duration = Duration::from_secs(5);
 /// copy of itself that does something else.
 pub fn declare_command() {
     HAS_COMMAND.store(true, Ordering::Relaxed);
+}
+
+/// Sets the level of the log of brokers that this process starts from now on. Without it, they read
+/// `RUST_LOG` of this process.
+pub fn set_log_level(level: LevelFilter) {
+    *LOG_LEVEL.lock().unwrap_or_else(PoisonError::into_inner) = Some(level);
 }
 
 /// Why the broker did not answer.
@@ -115,11 +125,7 @@ impl Broker {
             return Err(io::Error::new(io::ErrorKind::Unsupported, reason));
         }
         let (own, other) = pair()?;
-        let child = Command::new("/proc/self/exe")
-            .arg(COMMAND)
-            .stdin(Stdio::from(other))
-            .stdout(Stdio::null())
-            .spawn()?;
+        let child = command().stdin(Stdio::from(other)).spawn()?;
         Ok(Self {
             reach: Reach::Child(child),
             socket: Some(own),
@@ -380,6 +386,17 @@ impl Drop for Broker {
     }
 }
 
+/// Returns the command of a broker whose log has the level of this process.
+fn command() -> Command {
+    let mut command = Command::new("/proc/self/exe");
+    command.arg(COMMAND).stdout(Stdio::null());
+    let level = LOG_LEVEL.lock().unwrap_or_else(PoisonError::into_inner);
+    if let Some(level) = *level {
+        command.env("RUST_LOG", level.to_string());
+    }
+    command
+}
+
 fn is_closed(error: &io::Error) -> bool {
     let kinds = [
         io::ErrorKind::UnexpectedEof,
@@ -485,6 +502,14 @@ mod tests {
         drop(other);
         let ended = broker.processes();
         assert!(matches!(ended, Err(BrokerError::Ended)), "{ended:?}");
+    }
+
+    #[test]
+    fn a_broker_logs_at_the_level_of_the_process_that_starts_it() {
+        set_log_level(LevelFilter::WARN);
+        let command = command();
+        let level = command.get_envs().find(|(name, _)| *name == "RUST_LOG");
+        assert_eq!(level.unwrap().1.unwrap(), "warn");
     }
 
     #[test]
