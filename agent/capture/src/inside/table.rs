@@ -205,12 +205,13 @@ impl ProcessTable {
     }
 
     fn announced(&mut self, announcement: &Announcement, clocks: &Clocks, broker: &mut Broker) {
+        let is_transition = announcement.kind == announced::TRANSITION;
+        if is_transition && self.transitions.is_full() {
+            self.transitions.refuse();
+            return;
+        }
         let observed = self.observe(announcement.process, broker);
-        if announcement.kind == announced::TRANSITION {
-            if self.transitions.is_full() {
-                self.transitions.refuse();
-                return;
-            }
+        if is_transition {
             let transition = Transition {
                 process: announcement.process,
                 node: observed.names.machine(announcement.address),
