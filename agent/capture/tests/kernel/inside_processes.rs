@@ -4,6 +4,7 @@ mod deliveries;
 mod handoffs;
 mod kernel_trace;
 mod late;
+mod overlays;
 mod thread_states;
 
 use std::fs::File;
