@@ -5,8 +5,6 @@
 //! from its first message.
 
 use std::collections::BTreeMap;
-use std::fs;
-use std::os::unix::fs::MetadataExt as _;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
@@ -16,6 +14,7 @@ use ros2probe_attach::mapped::{LibraryId, Mapped};
 use ros2probe_attach::open::installed;
 use ros2probe_attach::request::Place;
 
+use super::library_id::id_as_mapped;
 use super::processes::Processes;
 use crate::error_chain::Reason;
 use crate::tables::Libraries;
@@ -108,13 +107,8 @@ impl<P> Attachments<P> {
         }
         self.is_installed = true;
         for path in installed(library) {
-            let Ok(metadata) = fs::metadata(&path) else {
+            let Ok(id) = id_as_mapped(&path) else {
                 continue;
-            };
-            let device = metadata.dev();
-            let id = LibraryId {
-                device: format!("{:02x}:{:02x}", libc::major(device), libc::minor(device)),
-                inode: metadata.ino(),
             };
             if self.libraries.contains_key(&id) || self.libraries.is_full() {
                 continue;

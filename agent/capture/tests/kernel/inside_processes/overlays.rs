@@ -1,11 +1,13 @@
 //! Libraries on overlays: those of root are attached, and those of users are not.
 
 use std::os::fd::AsRawFd as _;
+use std::path::PathBuf;
 
 use ros2probe_attach::functions::Library;
 use ros2probe_attach::mapped::{Mapped, Use};
 use ros2probe_attach::open::{OpenError, open};
 use ros2probe_attach::request::Place;
+use ros2probe_capture::uprobe::library_id::id_as_mapped;
 use tempfile::TempDir;
 
 use super::*;
@@ -39,10 +41,10 @@ impl Overlay {
     }
 
     /// Returns the library as other processes can open it.
-    fn library(&self) -> File {
+    fn library(&self) -> PathBuf {
         let id = self.process.child.id();
         let at = self.directory.path().display();
-        File::open(format!("/proc/{id}/root{at}/on/all/libtracetools.so")).unwrap()
+        format!("/proc/{id}/root{at}/on/all/libtracetools.so").into()
     }
 }
 
@@ -69,7 +71,7 @@ fn a_library_on_the_overlay_of_a_user_is_refused_in_a_process_of_the_host() {
     let options = ["--user", "--map-root-user"];
     let mut overlay = Overlay::new(&options, "echo ready && exec cat");
     overlay.process.end("ready");
-    let library = overlay.library();
+    let library = File::open(overlay.library()).unwrap();
     // SAFETY: a new mapping at an address of the kernel's choice; nothing refers to it.
     let page = unsafe {
         libc::mmap(
@@ -87,4 +89,12 @@ fn a_library_on_the_overlay_of_a_user_is_refused_in_a_process_of_the_host() {
         matches!(opened, Err(OpenError::MayNotAnswer(_))),
         "{opened:?}"
     );
+}
+
+#[test]
+fn an_installed_library_has_the_identity_that_processes_show() {
+    let mut overlay = Overlay::new(&[], "exec on/all/process");
+    overlay.process.run("publish 1");
+    let id = id_as_mapped(&overlay.library()).unwrap();
+    assert_eq!(id, mapped(overlay.process.child.id()).id);
 }
