@@ -228,8 +228,8 @@ fn has_mount_of_root(process: u32, file: &File) -> io::Result<bool> {
 
 /// Returns whether a mount is in the lines of `mountinfo` (proc_pid_mountinfo(5)).
 fn has_mount(mounts: &str, id: u64) -> bool {
-    let ids = mounts.lines().filter_map(|line| line.split(' ').next());
-    ids.filter_map(|text| text.parse().ok()).any(|each| id == each)
+    let mut ids = mounts.lines().filter_map(|line| line.split(' ').next());
+    ids.any(|each| each.parse() == Ok(id))
 }
 
 /// Fails if a library is on a file system in user space. Opening such a file may block forever.
