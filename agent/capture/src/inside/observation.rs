@@ -189,7 +189,10 @@ impl Observation {
             self.suspended_at = None;
             if let Err(error) = self.tables.forget_times(None) {
                 let reason = in_words(&error);
-                tracing::warn!(reason, "the next calls may seem to have lasted for the pause");
+                tracing::warn!(
+                    reason,
+                    "the next calls may seem to have lasted for the pause"
+                );
             }
             tracing::info!("attached again inside processes");
         }
