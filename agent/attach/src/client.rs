@@ -5,6 +5,7 @@ use std::os::fd::{AsFd as _, BorrowedFd, OwnedFd};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use rustix::net::sockopt::{Timeout, set_socket_timeout};
@@ -12,6 +13,7 @@ use rustix::net::{
     AddressFamily, SendFlags, SocketAddrUnix, SocketFlags, SocketType, connect, socket_with,
     socketpair,
 };
+use tracing::level_filters::LevelFilter;
 
 use crate::functions::{Calls, Library};
 use crate::mapped::Use;
@@ -26,6 +28,8 @@ use crate::server::answer::answer;
 pub const COMMAND: &str = "attach";
 /// Whether this program has [`COMMAND`].
 static HAS_COMMAND: AtomicBool = AtomicBool::new(false);
+/// Level of the log of a broker that this process starts; `None`: the broker has its own default.
+static LOG_LEVEL: Mutex<Option<LevelFilter>> = Mutex::new(None);
 /// Maximum time to wait for an answer. The broker itself gives up earlier.
 const RESPONSE_TIMEOUT: Duration = REQUEST_TIMEOUT.saturating_add(Duration::from_secs(1));
 /// Pause before another attempt to connect.
@@ -35,6 +39,12 @@ const RETRY: Duration = Duration::from_secs(5);
 /// copy of itself that does something else.
 pub fn declare_command() {
     HAS_COMMAND.store(true, Ordering::Relaxed);
+}
+
+/// Sets the level of the log of brokers that this process starts from now on. Without it, they read
+/// `RUST_LOG` of this process.
+pub fn set_log_level(level: LevelFilter) {
+    *LOG_LEVEL.lock().unwrap_or_else(PoisonError::into_inner) = Some(level);
 }
 
 /// Why the broker did not answer.
@@ -117,11 +127,7 @@ impl Broker {
             return Err(io::Error::new(io::ErrorKind::Unsupported, reason));
         }
         let (own, other) = pair()?;
-        let child = Command::new("/proc/self/exe")
-            .arg(COMMAND)
-            .stdin(Stdio::from(other))
-            .stdout(Stdio::null())
-            .spawn()?;
+        let child = command().stdin(Stdio::from(other)).spawn()?;
         Ok(Self {
             reach: Reach::Child(child),
             socket: Some(own),
@@ -320,8 +326,12 @@ impl Broker {
         }
     }
 
-    /// Drops a connection that has failed, and returns the error.
+    /// Drops a connection that has failed, and returns the error. A child has only one connection,
+    /// which therefore stays after a timeout: later requests skip the late answer.
     fn lost(&mut self, error: io::Error) -> BrokerError {
+        if matches!(self.reach, Reach::Child(_)) && error.kind() == io::ErrorKind::WouldBlock {
+            return BrokerError::Answer(error);
+        }
         self.socket = None;
         match self.reach {
             Reach::Child(_) => BrokerError::Ended,
@@ -376,6 +386,17 @@ impl Drop for Broker {
             let _ = child.wait();
         }
     }
+}
+
+/// Returns the command of a broker whose log has the level of this process.
+fn command() -> Command {
+    let mut command = Command::new("/proc/self/exe");
+    command.arg(COMMAND).stdout(Stdio::null());
+    let level = LOG_LEVEL.lock().unwrap_or_else(PoisonError::into_inner);
+    if let Some(level) = *level {
+        command.env("RUST_LOG", level.to_string());
+    }
+    command
 }
 
 fn is_closed(error: &io::Error) -> bool {
@@ -442,4 +463,83 @@ fn bounded(socket: &OwnedFd) -> io::Result<()> {
         set_socket_timeout(socket, timeout, Some(RESPONSE_TIMEOUT))?;
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::thread;
+
+    use super::*;
+
+    /// Returns a client of a child that answers nothing, and the child's end of the connection.
+    fn child() -> (Broker, OwnedFd) {
+        let (own, other) = pair().unwrap();
+        let short = Some(Duration::from_millis(200));
+        set_socket_timeout(&own, Timeout::Recv, short).unwrap();
+        let child = Command::new("true").spawn().unwrap();
+        let broker = Broker {
+            reach: Reach::Child(child),
+            socket: Some(own),
+            failed: None,
+            number: 0,
+        };
+        (broker, other)
+    }
+
+    fn reply(socket: &OwnedFd, number: u64, content: Answer) {
+        let answer = Numbered { number, content };
+        send(socket.as_fd(), &answer, &[], SendFlags::empty()).unwrap();
+    }
+
+    #[test]
+    fn a_broker_that_answers_too_late_once_is_asked_again() {
+        let (mut broker, other) = child();
+        let late = broker.processes();
+        assert!(matches!(late, Err(BrokerError::Answer(_))), "{late:?}");
+        reply(&other, 1, Answer::Processes(vec![1]));
+        reply(&other, 1, Answer::End);
+        reply(&other, 2, Answer::Processes(vec![2]));
+        reply(&other, 2, Answer::End);
+        assert_eq!(broker.processes().unwrap(), [2]);
+        drop(other);
+        let ended = broker.processes();
+        assert!(matches!(ended, Err(BrokerError::Ended)), "{ended:?}");
+    }
+
+    #[test]
+    fn a_broker_logs_at_the_level_of_the_process_that_starts_it() {
+        set_log_level(LevelFilter::WARN);
+        let command = command();
+        let level = command.get_envs().find(|(name, _)| *name == "RUST_LOG");
+        assert_eq!(level.unwrap().1.unwrap(), "warn");
+    }
+
+    #[test]
+    fn a_signal_does_not_end_the_wait_for_an_answer() {
+        extern "C" fn ignore(_: libc::c_int) {}
+        let handler = ignore as extern "C" fn(libc::c_int);
+        // SAFETY: the handler does nothing, and the action is zeroed apart from it.
+        unsafe {
+            let mut action: libc::sigaction = std::mem::zeroed();
+            action.sa_sigaction = handler as libc::sighandler_t;
+            assert_eq!(
+                libc::sigaction(libc::SIGUSR1, &raw const action, std::ptr::null_mut()),
+                0
+            );
+        }
+        let (mut broker, other) = child();
+        // SAFETY: no preconditions.
+        let waiting = unsafe { libc::pthread_self() };
+        let interrupter = thread::spawn(move || {
+            for _ in 0..10 {
+                thread::sleep(Duration::from_millis(10));
+                // SAFETY: the thread waits for this one below.
+                unsafe { libc::pthread_kill(waiting, libc::SIGUSR1) };
+            }
+            reply(&other, 1, Answer::End);
+            other
+        });
+        assert!(broker.processes().unwrap().is_empty());
+        drop(interrupter.join());
+    }
 }

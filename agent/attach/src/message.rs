@@ -4,6 +4,7 @@ use std::io::{self, IoSlice, IoSliceMut};
 use std::mem::MaybeUninit;
 use std::os::fd::{BorrowedFd, OwnedFd};
 
+use rustix::io::retry_on_intr;
 use rustix::net::{
     RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, ReturnFlags, SendAncillaryBuffer,
     SendAncillaryMessage, SendFlags, recvmsg, sendmsg,
@@ -36,7 +37,7 @@ pub(crate) fn send<T: Serialize>(
         ancillary.push(SendAncillaryMessage::ScmRights(descriptors));
     }
     let flags = flags | SendFlags::NOSIGNAL;
-    sendmsg(socket, &[IoSlice::new(&bytes)], &mut ancillary, flags)?;
+    retry_on_intr(|| sendmsg(socket, &[IoSlice::new(&bytes)], &mut ancillary, flags))?;
     Ok(())
 }
 
@@ -53,7 +54,8 @@ pub(crate) fn receive<T: DeserializeOwned>(
     let flags = RecvFlags::CMSG_CLOEXEC;
     let received = {
         let mut buffers = [IoSliceMut::new(&mut bytes)];
-        recvmsg(socket, &mut buffers, &mut ancillary, flags)?
+        // With a timeout, a signal always interrupts the call (signal(7)).
+        retry_on_intr(|| recvmsg(socket, &mut buffers, &mut ancillary, flags))?
     };
     let descriptors = ancillary.drain().filter_map(|message| match message {
         RecvAncillaryMessage::ScmRights(descriptors) => Some(descriptors),

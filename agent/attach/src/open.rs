@@ -2,10 +2,11 @@
 
 use std::fs::{self, File};
 use std::io::{self, Read as _};
+use std::os::fd::AsRawFd as _;
 use std::os::unix::fs::MetadataExt as _;
 use std::path::{Component, Path, PathBuf};
 
-use rustix::fs::{CWD, Mode, OFlags, fstatfs, openat};
+use rustix::fs::{AtFlags, CWD, Mode, OFlags, StatxFlags, fstatfs, openat, statx};
 use rustix::io::Errno;
 
 use crate::functions::Library;
@@ -192,21 +193,46 @@ fn not_opened(error: Errno) -> OpenError {
 }
 
 /// Fails unless the file is on a local file system. An overlay counts as local if only root can
-/// have mounted it: `process`, which maps the file, is then in the broker's user namespace.
+/// have mounted it: `process`, which maps the file, then sees this mount, and is in the broker's
+/// user namespace. A user's overlay in a user namespace may lie on FUSE, and another process can
+/// open its files through `/proc/<pid>/root`.
 fn check_file_system(file: &File, process: Option<u32>) -> Result<(), OpenError> {
     let kind = fstatfs(file)
         .map_err(|error| OpenError::Open(error.into()))?
         .f_type;
     let kind = u32::try_from(kind & 0xffff_ffff).unwrap_or_default();
     let by_root = || {
-        let own = fs::read_link("/proc/self/ns/user").ok();
-        let of = |process| fs::read_link(format!("/proc/{process}/ns/user")).ok();
-        own.is_some() && process.is_none_or(|process| of(process) == own)
+        let has_mount = |process| has_mount_of_root(process, file).unwrap_or(false);
+        process.is_none_or(has_mount)
     };
     match LOCAL_FILE_SYSTEMS.contains(&kind) || kind == OVERLAYFS_MAGIC && by_root() {
         true => Ok(()),
         false => Err(OpenError::MayNotAnswer(format!("{kind:#x}"))),
     }
+}
+
+/// Returns whether a process sees the mount of a file, and is in the broker's user namespace.
+fn has_mount_of_root(process: u32, file: &File) -> io::Result<bool> {
+    // The descriptor refers to the same process even if another one receives its id.
+    let directory = File::open(format!("/proc/{process}"))?;
+    let of_it = format!("/proc/self/fd/{}", directory.as_raw_fd());
+    let status = statx(file, "", AtFlags::EMPTY_PATH, StatxFlags::MNT_ID)?;
+    let mut mounts = Vec::new();
+    let listed = File::open(format!("{of_it}/mountinfo"))?;
+    listed.take(MAX_MOUNTS).read_to_end(&mut mounts)?;
+    let has_mount = has_mount(&String::from_utf8_lossy(&mounts), status.stx_mnt_id);
+    // A process that leaves the namespace cannot return, so it was there when the mounts were read.
+    let is_in_own = || {
+        let own = fs::read_link("/proc/self/ns/user")?;
+        io::Result::Ok(fs::read_link(format!("{of_it}/ns/user"))? == own)
+    };
+    Ok(has_mount && is_in_own()?)
+}
+
+/// Returns whether a mount is in the lines of `mountinfo` (proc_pid_mountinfo(5)).
+fn has_mount(mounts: &str, id: u64) -> bool {
+    let mut ids = mounts.lines().filter_map(|line| line.split(' ').next());
+    ids.any(|each| each.parse() == Ok(id))
 }
 
 /// Fails if a library is on a file system in user space. Opening such a file may block forever.
@@ -277,6 +303,17 @@ mod tests {
         ] {
             assert_eq!(file_system(MOUNTS, device), name, "{device}");
         }
+    }
+
+    #[test]
+    fn a_mount_is_found_by_its_id_alone() {
+        assert!(has_mount(MOUNTS, 22) && has_mount(MOUNTS, 62));
+        for other in [1, 2, 55, 254, u64::MAX] {
+            assert!(!has_mount(MOUNTS, other), "{other}");
+        }
+        let file = File::open("/proc/self/exe").unwrap();
+        assert!(has_mount_of_root(std::process::id(), &file).unwrap());
+        assert!(has_mount_of_root(u32::MAX, &file).is_err());
     }
 
     #[test]

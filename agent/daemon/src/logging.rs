@@ -8,6 +8,7 @@ use std::sync::{Arc, Mutex};
 
 use crate::config::Level;
 use lines::Lines;
+use ros2probe_attach::client::set_log_level;
 use ros2probe_metrics::otlp::LogQueue;
 use tracing_subscriber::filter::{EnvFilter, LevelFilter};
 use tracing_subscriber::layer::SubscriberExt as _;
@@ -30,6 +31,9 @@ impl Log {
     #[must_use]
     pub fn start(level: Level, exported: Option<LevelFilter>) -> Self {
         let fixed = EnvFilter::try_from_default_env().ok();
+        if fixed.is_none() {
+            set_log_level(level.filter());
+        }
         let (filter, handle) = reload::Layer::new(fixed.clone().unwrap_or_else(|| filter(level)));
         // The journal adds its own timestamps.
         let journal = std::env::var_os("JOURNAL_STREAM").is_some();
@@ -69,9 +73,11 @@ impl Log {
 
     /// Changes the level.
     pub(crate) fn set(&self, level: Level) {
-        if !self.fixed
-            && let Err(error) = self.level.reload(filter(level))
-        {
+        if self.fixed {
+            return;
+        }
+        set_log_level(level.filter());
+        if let Err(error) = self.level.reload(filter(level)) {
             tracing::warn!(%error, "the log level was not changed");
         }
     }

@@ -33,8 +33,10 @@ use crate::tables::CallbackBounds;
 pub const MIN_BOUND: Duration = Duration::from_millis(5);
 /// Ratio of a learnt bound to the 99th percentile.
 const BOUND_FACTOR: u64 = 3;
-/// Minimum number of calls from which a bound is learnt.
-const MIN_LEARNT_CALLS: f32 = 50.0;
+/// Minimum number of calls from which a bound is learnt, however rare they are.
+const MIN_LEARNT_CALLS: u64 = 50;
+/// Minimum weight of recent calls from which a bound changes: that of one call two minutes ago.
+const MIN_RECENT_WEIGHT: f32 = 0.5;
 /// Part of the calls so far that is forgotten in each round: a round is a second, so that the
 /// bound describes the last minutes.
 const DECAY: f32 = 1.0 / 180.0;
@@ -84,6 +86,8 @@ struct Learnt {
     known: [[u32; BUCKETS]; 2],
     /// Calls of the last minutes.
     recent: [[f32; BUCKETS]; 2],
+    /// All calls so far.
+    calls: [u64; 2],
     /// The learnt bounds.
     learnt: Option<[u64; 2]>,
     /// The bounds that the programs have.
@@ -272,6 +276,7 @@ impl Default for Learnt {
         Self {
             known: [[0; BUCKETS]; 2],
             recent: [[0.0; BUCKETS]; 2],
+            calls: [0; 2],
             learnt: None,
             set: None,
         }
@@ -284,11 +289,12 @@ impl Learnt {
     #[expect(clippy::cast_precision_loss, reason = "calls of a second are few")]
     fn add(&mut self, counts: &[[u32; BUCKETS]; 2]) {
         let all = self.recent.iter_mut().zip(&mut self.known).zip(counts);
-        for ((recent, known), counts) in all {
+        for (((recent, known), counts), calls) in all.zip(&mut self.calls) {
             for ((recent, known), count) in recent.iter_mut().zip(known.iter_mut()).zip(counts) {
                 // Smaller counts began anew.
                 let new = count.checked_sub(*known).unwrap_or(*count);
                 *recent = *recent * (1.0 - DECAY) + new as f32;
+                *calls += u64::from(new);
                 *known = *count;
             }
         }
@@ -309,12 +315,15 @@ impl Learnt {
     /// `None` before enough calls.
     fn bounds(&self) -> Option<[u64; 2]> {
         let [duration, delay] = &self.recent;
-        let bound = |counts: &[f32; BUCKETS]| {
+        let [durations, delays] = self.calls;
+        let bound = |counts: &[f32; BUCKETS], calls: u64| {
             let least = u64::try_from(MIN_BOUND.as_nanos()).unwrap_or(u64::MAX);
-            p99(counts).map(|p99| p99.saturating_mul(BOUND_FACTOR).max(least))
+            let p99 = (calls >= MIN_LEARNT_CALLS).then(|| p99(counts)).flatten()?;
+            Some(p99.saturating_mul(BOUND_FACTOR).max(least))
         };
         // Some callbacks have no delay, for example those of services.
-        Some([bound(duration)?, bound(delay).unwrap_or(u64::MAX)])
+        let delay = bound(delay, delays).unwrap_or(u64::MAX);
+        Some([bound(duration, durations)?, delay])
     }
 
     /// Returns whether bounds differ from those that the programs have by more than a step of the
@@ -331,11 +340,11 @@ impl Learnt {
     }
 }
 
-/// Returns the upper end of the bucket with the 99th percentile, in nanoseconds; `None` if there
-/// are few values.
+/// Returns the upper end of the bucket with the 99th percentile, in nanoseconds; `None` without
+/// recent values.
 fn p99(counts: &[f32; BUCKETS]) -> Option<u64> {
     let all: f32 = counts.iter().sum();
-    if all < MIN_LEARNT_CALLS {
+    if all < MIN_RECENT_WEIGHT {
         return None;
     }
     let mut below = 0.0;
@@ -627,6 +636,23 @@ mod tests {
         let [duration, delay] = learnt.learnt.unwrap();
         assert!((60_000_000..=84_000_000).contains(&duration), "{duration}");
         assert_eq!(delay, u64::MAX, "no call waited");
+    }
+
+    #[test]
+    fn a_bound_of_rare_calls_is_learnt_from_50_of_them() {
+        let mut learnt = Learnt::default();
+        for second in 0..1000 {
+            let calls = second / 20;
+            learnt.add(&counts(&[(400, calls)]));
+            assert_eq!(learnt.learnt.is_some(), calls >= 50, "{calls} calls");
+        }
+        learnt.add(&counts(&[(400, 50)]));
+        let usual = learnt.learnt.unwrap();
+        // Without calls, the bound stays.
+        for _ in 0..100_000 {
+            learnt.add(&counts(&[(400, 50)]));
+        }
+        assert_eq!(learnt.learnt, Some(usual));
     }
 
     #[test]

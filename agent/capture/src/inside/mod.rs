@@ -130,7 +130,7 @@ impl Inside {
         let mut probes = Probes::new(&programs, is_on_demand, &progress);
         // A node announces its publishers only once, so the probes are attached to installed
         // libraries in advance.
-        probes.install(Instant::now(), &mut broker);
+        probes.install(true, Instant::now(), &mut broker);
         progress.set_idle();
         let scope = cgroup.map_or(Scope::AllProcesses, |path| {
             Scope::Cgroup(path.to_path_buf())

@@ -74,15 +74,20 @@ impl Probes {
         }
     }
 
-    /// Attaches the lasting probes to installed libraries.
-    pub(super) fn install(&mut self, now: Instant, broker: &mut Broker) {
-        self.lasting.install(Library::Tracing, now, broker);
+    /// Attaches the lasting probes to installed libraries. Without `to_calls`, they stay detached if
+    /// they are also at calls.
+    pub(super) fn install(&mut self, to_calls: bool, now: Instant, broker: &mut Broker) {
+        if to_calls || self.on_demand.is_some() {
+            self.lasting.install(Library::Tracing, now, broker);
+        }
     }
 
-    /// Attaches the lasting probes to the libraries in use; with `to_calls`, also the on-demand
-    /// probes.
+    /// Attaches the lasting probes to the libraries in use, as [`Self::install`] does; with
+    /// `to_calls`, also the on-demand probes.
     fn follow(&mut self, processes: &Processes, to_calls: bool, now: Instant, broker: &mut Broker) {
-        self.lasting.follow(processes, now, broker);
+        if to_calls || self.on_demand.is_some() {
+            self.lasting.follow(processes, now, broker);
+        }
         if let Some(on_demand) = self.on_demand.as_mut().filter(|_| to_calls) {
             on_demand.install(Library::Tracing, now, broker);
             on_demand.follow(processes, now, broker);
@@ -185,6 +190,13 @@ impl Observation {
             .is_some_and(|at| now - at >= SUSPENSION_TIME)
         {
             self.suspended_at = None;
+            if let Err(error) = self.tables.forget_times(None) {
+                let reason = in_words(&error);
+                tracing::warn!(
+                    reason,
+                    "the next calls may seem to have lasted for the pause"
+                );
+            }
             tracing::info!("attached again inside processes");
         }
         // A late round is skipped, so the observation ends only when its last round can be
@@ -225,7 +237,7 @@ impl Observation {
                     &mut self.without_mappings,
                 );
             }
-            self.probes.install(now, broker);
+            self.probes.install(to_calls, now, broker);
         }
         self.probes.follow(&self.processes, to_calls, now, broker);
         self.is_broker_unavailable = failed.is_some();
@@ -290,6 +302,9 @@ impl Observation {
         }
         self.wait(shared, now + REPORT_INTERVAL);
         self.set_clocks();
+        let elapsed = self.last_round.elapsed();
+        self.last_round += elapsed;
+        (self.table).apply_budgets(&mut self.tables, elapsed, &mut self.broker);
         (self.table).drain(&mut self.tables, &Clocks::read(), &mut self.broker);
         self.broker.disconnect();
     }
@@ -419,4 +434,67 @@ enum Event {
     Announced,
     /// The first client needs calls, or the last one no longer needs them.
     Demanded,
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::atomic::AtomicU32;
+
+    use ros2probe_attach::mapped::{self, LibraryId, Mapped};
+
+    use super::*;
+    use crate::uprobe::attachments::Refusal;
+
+    /// Probes whose attempts to attach are counted and refused.
+    fn counted(attempts: &Arc<AtomicU32>) -> Attachments<Attached> {
+        let attempts = Arc::clone(attempts);
+        Attachments::new(
+            "",
+            Box::new(move |_, _| {
+                attempts.fetch_add(1, Ordering::Relaxed);
+                Err(Refusal::Program("no program".into()))
+            }),
+        )
+    }
+
+    #[test]
+    fn probes_at_calls_stay_detached_for_the_pause_and_the_others_do_not() {
+        let used = mapped::Use {
+            libraries: vec![Mapped {
+                id: LibraryId {
+                    device: "fe:00".to_owned(),
+                    inode: 7,
+                },
+                path: "/libtracetools.so".into(),
+                range: String::new(),
+            }],
+            shares: false,
+        };
+        let processes = Processes::of(std::process::id(), used.into());
+        for is_on_demand in [false, true] {
+            let [lasting, on_demand] = [const { AtomicU32::new(0) }; 2].map(Arc::new);
+            let mut probes = Probes {
+                lasting: counted(&lasting),
+                on_demand: is_on_demand.then(|| counted(&on_demand)),
+            };
+            let at_calls = if is_on_demand { &on_demand } else { &lasting };
+            let attempts = |of: &Arc<AtomicU32>| of.load(Ordering::Relaxed);
+            let (mut now, broker) = (Instant::now(), &mut Broker::here());
+            let mut follow = |probes: &mut Probes, to_calls| {
+                now += RETRY;
+                probes.install(to_calls, now, broker);
+                probes.follow(&processes, to_calls, now, broker);
+            };
+            follow(&mut probes, true);
+            let before = attempts(at_calls);
+            assert!(before > 0);
+            probes.detach();
+            let before_lasting = attempts(&lasting);
+            follow(&mut probes, false);
+            assert_eq!(attempts(at_calls), before, "they are detached");
+            assert_eq!(attempts(&lasting) > before_lasting, is_on_demand);
+            follow(&mut probes, true);
+            assert!(attempts(at_calls) > before, "the pause is over");
+        }
+    }
 }

@@ -39,7 +39,8 @@ const DISPATCHER: Dispatcher = Dispatcher {
 type FiguresWords = [u64; size_of::<Figures>() / 8];
 type ProcessWords = [u64; size_of::<Process>() / 8];
 type HandleWords = [u64; size_of::<Handle>() / 8];
-/// Words of `Thread` and `Entry` in the kernel programs.
+/// Words of `Thread` and `Entry` in the kernel programs. The second and third word of `Thread` are a
+/// `Handle`. `Entry` has the process at the same place as `Handle`.
 type ThreadWords = [u64; 22];
 type EntryWords = [u64; 2];
 type BoundWords = [u64; size_of::<Bound>() / 8];
@@ -329,6 +330,54 @@ impl Tables {
         }
         clear(&mut self.threads).map_err(failed("THREADS", "remove"))?;
         clear(&mut self.waiting).map_err(failed("WAITING", "remove"))
+    }
+
+    /// Forgets when the calls of a process happened, or with `None` those of all processes, while the
+    /// programs do not count them. Otherwise the next call would seem to have lasted since then.
+    /// Counts stay.
+    ///
+    /// # Errors
+    /// Fails if the kernel refuses an update.
+    pub fn forget_times(&mut self, process: Option<u32>) -> Result<(), FilterError> {
+        let is_of = |id: u32| process.is_none_or(|process| process == id);
+        let handles: Vec<_> = self.figures().collect();
+        for (handle, figures) in handles {
+            if is_of(handle.process) && (figures.last, figures.due) != (0, 0) {
+                let (last, due) = (0, 0);
+                let new = Figures {
+                    last,
+                    due,
+                    ..figures
+                };
+                let (key, words): (HandleWords, FiguresWords) =
+                    (zerocopy::transmute!(handle), zerocopy::transmute!(new));
+                let set = self.handles.insert(key, words, 0);
+                set.map_err(failed("HANDLES", "update"))?;
+            }
+        }
+        let is_thread = |words: &ThreadWords| {
+            let [_, address, rest, ..] = *words;
+            let input: Handle = zerocopy::transmute!([address, rest]);
+            // A thread that has taken nothing yet has no process.
+            input.process == 0 || is_of(input.process)
+        };
+        let threads = self.threads.iter().filter_map(Result::ok);
+        let threads: Vec<_> = threads.filter(|(_, words)| is_thread(words)).collect();
+        for (id, _) in threads {
+            let removed = absent_is_fine(self.threads.remove(&id));
+            removed.map_err(failed("THREADS", "remove"))?;
+        }
+        let is_entry = |words: &EntryWords| {
+            let entry: Handle = zerocopy::transmute!(*words);
+            is_of(entry.process)
+        };
+        let entries = self.waiting.keys().filter_map(Result::ok);
+        let entries: Vec<_> = entries.filter(is_entry).collect();
+        for entry in entries {
+            let removed = absent_is_fine(self.waiting.remove(&entry));
+            removed.map_err(failed("WAITING", "remove"))?;
+        }
+        Ok(())
     }
 
     /// Sets what the programs observe about late calls, one of [`late::mode`]. Threads are followed

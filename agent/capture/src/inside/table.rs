@@ -39,6 +39,9 @@ use crate::tables::{
 pub const MAX_PROCESS_HITS: u64 = 50_000;
 /// Minimum time over which calls per second are evaluated: a shorter time may contain only a burst.
 const MIN_EVALUATION_TIME: Duration = Duration::from_millis(500);
+/// Number of items of the announcement ring that are read together: twice as many as fit into it.
+/// A process that announces without end must not keep the thread from applying its budget.
+const DRAIN_BATCH: usize = 10_000;
 /// Number of rounds after which a process outside of the control group is inspected again.
 const RECHECK_ROUNDS: u32 = 5;
 
@@ -77,7 +80,10 @@ struct Observed {
     /// Whether the process had ended before it was inspected. Another process may have its id by
     /// now.
     had_ended: bool,
-    domain: DomainId,
+    /// Domain of its environment; `None` until the broker has answered.
+    domain: Option<DomainId>,
+    /// Number of requests for it that failed.
+    failed_requests: u32,
     names: Names,
     new_nodes: Bounded<NewNodes, Vec<NodeName>>,
     /// Number of calls at the last evaluation.
@@ -93,6 +99,16 @@ struct Observed {
 type Mark = [u64; 5];
 
 impl Observed {
+    /// Asks the broker for the domain, and returns whether it answered. The environment of a process
+    /// that cannot be read has domain 0.
+    fn find_domain(&mut self, process: u32, broker: &mut Broker) -> bool {
+        match broker.domain(process) {
+            Ok(domain) => self.domain = Some(DomainId(domain.unwrap_or_default())),
+            Err(_) => self.failed_requests = self.failed_requests.saturating_add(1),
+        }
+        self.domain.is_some()
+    }
+
     fn buffer(&self, address: u64) -> Option<Endpoint> {
         let publisher = self.buffers.get(&address).copied();
         self.names.buffer(address, publisher.unwrap_or_default())
@@ -157,9 +173,20 @@ impl ProcessTable {
         self.known.is_empty()
     }
 
-    /// Reads the waiting announcements. `broker` provides facts about the processes.
+    /// Reads the waiting announcements, but not all that processes make meanwhile. `broker` provides
+    /// facts about the processes.
     pub fn drain(&mut self, tables: &mut Tables, clocks: &Clocks, broker: &mut Broker) {
-        while let Some(item) = tables.next_announcement(Item::read) {
+        let items = std::iter::from_fn(|| tables.next_announcement(Item::read));
+        self.apply_items(items, clocks, broker);
+    }
+
+    fn apply_items(
+        &mut self,
+        items: impl Iterator<Item = Option<Item>>,
+        clocks: &Clocks,
+        broker: &mut Broker,
+    ) {
+        for item in items.take(DRAIN_BATCH) {
             self.apply_item(item, clocks, broker);
         }
     }
@@ -185,8 +212,13 @@ impl ProcessTable {
         clocks: &Clocks,
         broker: &mut Broker,
     ) {
+        let is_transition = announcement.kind == announced::TRANSITION;
+        if is_transition && self.transitions.is_full() {
+            self.transitions.refuse();
+            return;
+        }
         let observed = self.observe(announcement.process, broker);
-        if announcement.kind == announced::TRANSITION {
+        if is_transition {
             let transition = Transition {
                 process: announcement.process,
                 node: observed.names.machine(announcement.address),
@@ -206,20 +238,36 @@ impl ProcessTable {
     /// number of processes.
     fn observe(&mut self, process: u32, broker: &mut Broker) -> &mut Observed {
         self.known.entry(process).or_insert_with(|| {
-            // Without an answer, the process has no name, and its domain is assumed to be 0.
+            // Without an answer, the process has no name, and its domain is assumed to be 0 until a
+            // later round.
             let states = broker.activities(&[process]);
             let had_ended = states.as_ref().is_ok_and(Vec::is_empty);
             let state = states.unwrap_or_default().into_iter().next();
-            let domain = state
-                .is_some()
-                .then(|| broker.domain(process).ok().flatten());
-            Observed {
-                domain: DomainId(domain.flatten().unwrap_or_default()),
+            let mut observed = Observed {
                 stat: state.map(Stat::from),
                 had_ended,
                 ..Observed::default()
+            };
+            if observed.stat.is_some() {
+                observed.find_domain(process, broker);
             }
+            observed
         })
+    }
+
+    /// Asks again for the domains of running processes, until the broker does not answer. Processes
+    /// with the fewest failed requests come first, because a request may take half a second.
+    fn find_domains(&mut self, running: &HashMap<u32, Stat>, broker: &mut Broker) {
+        let unknown = self.known.iter_mut().filter(|(id, observed)| {
+            observed.domain.is_none() && !observed.had_ended && running.contains_key(id)
+        });
+        let mut unknown: Vec<_> = unknown.collect();
+        unknown.sort_by_key(|(_, observed)| observed.failed_requests);
+        for (id, observed) in unknown {
+            if !observed.find_domain(*id, broker) {
+                return;
+            }
+        }
     }
 
     /// Makes the next round report everything again, after [`Tables::forget_calls`].
@@ -277,11 +325,9 @@ impl ProcessTable {
         delivery: impl Fn(&late::LateCall) -> Option<MessageDelivery>,
     ) -> Round {
         self.rounds = self.rounds.wrapping_add(1);
-        self.since_evaluation += elapsed;
-        let is_due = self.since_evaluation >= MIN_EVALUATION_TIME;
-        let judged = is_due.then(|| std::mem::take(&mut self.since_evaluation));
+        let hits = self.apply_budgets(tables, elapsed, broker);
         self.drain(tables, clocks, broker);
-        let (mut reports, mut hits) = (HashMap::new(), 0);
+        let mut reports = HashMap::new();
         let processes: Vec<_> = tables.processes().collect();
         let counted = processes
             .iter()
@@ -298,15 +344,15 @@ impl ProcessTable {
                 .map(|state| (state.process, state.into()));
             states.collect::<HashMap<u32, Stat>>()
         });
+        if let Some(running) = &states {
+            self.find_domains(running, broker);
+        }
         for (id, process) in &processes {
             if process.state == state::OUTSIDE {
                 if self.rounds.is_multiple_of(RECHECK_ROUNDS) {
                     let _ = tables.remove_process(*id);
                 }
                 continue;
-            }
-            if let Some(over) = judged {
-                hits += self.apply_budget(tables, *id, process, over);
             }
             let report = self.process(*id, process, states.as_ref());
             reports.insert(*id, report);
@@ -393,8 +439,8 @@ impl ProcessTable {
         ProcessReport {
             id,
             name: stat.map(|stat| Arc::clone(&stat.name)),
-            domain_id: observed.domain,
-            cpu: stat.map(|stat| stat.cpu).unwrap_or_default(),
+            domain_id: observed.domain.unwrap_or_default(),
+            cpu: stat.map(|stat| stat.cpu),
             hits: process.hits,
             refused: process.refused,
             is_suspended: observed.is_suspended,
@@ -402,6 +448,30 @@ impl ProcessTable {
             nodes: observed.new_nodes.take(),
             ..ProcessReport::default()
         }
+    }
+
+    /// Applies the budget of each process, before its announcements are read. `elapsed`: time since
+    /// the last call. Returns the calls per second of all processes; 0 if they were not evaluated.
+    pub fn apply_budgets(
+        &mut self,
+        tables: &mut Tables,
+        elapsed: Duration,
+        broker: &mut Broker,
+    ) -> u64 {
+        self.since_evaluation += elapsed;
+        if self.since_evaluation < MIN_EVALUATION_TIME {
+            return 0;
+        }
+        let over = std::mem::take(&mut self.since_evaluation);
+        let processes: Vec<_> = tables.processes().collect();
+        let counted = processes
+            .iter()
+            .filter(|(_, process)| process.state != state::OUTSIDE);
+        let hits = counted.map(|(id, process)| {
+            self.observe(*id, broker);
+            self.apply_budget(tables, *id, process, over)
+        });
+        hits.sum()
     }
 
     /// Applies the budget of a process to its calls over this time. Returns its calls per second.
@@ -428,7 +498,11 @@ impl ProcessTable {
             true => state::SUSPENDED,
             false => state::COUNTED,
         };
-        let changed = tables.set_process(id, Process { state, ..*process });
+        let changed = match is_suspended {
+            true => Ok(()),
+            false => tables.forget_times(Some(id)),
+        };
+        let changed = changed.and_then(|()| tables.set_process(id, Process { state, ..*process }));
         if changed.is_ok() {
             observed.is_suspended = is_suspended;
             tracing::info!(
@@ -626,7 +700,7 @@ impl ProcessTable {
             _ => return None,
         };
         Some(CausalPublication {
-            domain_id: observed.domain,
+            domain_id: observed.domain.unwrap_or_default(),
             process: hop.process,
             node: output.node.or(input.node),
             input: TopicName::from(&*input.name),
@@ -714,6 +788,18 @@ mod tests {
         assert_driven::<NewNodes>();
         assert_driven::<Transitions>();
         assert_eq!(table.transitions.len(), Transitions::CAP);
+    }
+
+    #[test]
+    fn announcements_without_end_are_read_in_parts() {
+        let (mut table, clocks) = (table(), Clocks::read());
+        let mut read = 0;
+        let endless = std::iter::repeat_with(|| {
+            read += 1;
+            Some(Item::Hop(inside::Hop::new_zeroed()))
+        });
+        table.apply_items(endless, &clocks, &mut Broker::here());
+        assert_eq!(read, DRAIN_BATCH);
     }
 
     #[test]

@@ -5,8 +5,6 @@
 //! from its first message.
 
 use std::collections::BTreeMap;
-use std::fs;
-use std::os::unix::fs::MetadataExt as _;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
@@ -16,6 +14,7 @@ use ros2probe_attach::mapped::{LibraryId, Mapped};
 use ros2probe_attach::open::installed;
 use ros2probe_attach::request::Place;
 
+use super::library_id::id_as_mapped;
 use super::processes::Processes;
 use crate::error_chain::Reason;
 use crate::tables::Libraries;
@@ -23,8 +22,13 @@ use ros2probe_model::facts::bounded::Bounded;
 
 /// How long an unused library stays attached.
 pub const DETACH_DELAY: Duration = Duration::from_secs(60);
-/// Pause before another attempt to attach to a library.
+/// Pause before another attempt to attach to a library. It doubles with each refusal, up to
+/// [`LONGEST_RETRY_DELAY`].
 pub const RETRY_DELAY: Duration = Duration::from_secs(5);
+const LONGEST_RETRY_DELAY: Duration = Duration::from_secs(320);
+/// Time of failed attempts after which the other libraries wait for the next call. The broker may
+/// need seconds for each refusal.
+const FAILURE_TIME: Duration = Duration::from_secs(2);
 /// All known libraries, with a probe `P` in each.
 pub struct Attachments<P> {
     attach: Attach<P>,
@@ -42,7 +46,9 @@ struct Known<P> {
     probe: Result<P, Reason>,
     processes: usize,
     used: Instant,
-    tried: Instant,
+    /// Time after which another attempt is made, and the pause before it.
+    retried: Instant,
+    pause: Duration,
     /// Whether the probe was attached before any process used the library, and is kept.
     is_installed: bool,
 }
@@ -101,13 +107,8 @@ impl<P> Attachments<P> {
         }
         self.is_installed = true;
         for path in installed(library) {
-            let Ok(metadata) = fs::metadata(&path) else {
+            let Ok(id) = id_as_mapped(&path) else {
                 continue;
-            };
-            let device = metadata.dev();
-            let id = LibraryId {
-                device: format!("{:02x}:{:02x}", libc::major(device), libc::minor(device)),
-                inode: metadata.ino(),
             };
             if self.libraries.contains_key(&id) || self.libraries.is_full() {
                 continue;
@@ -120,7 +121,8 @@ impl<P> Attachments<P> {
                         probe: Ok(probe),
                         processes: 0,
                         used: now,
-                        tried: now,
+                        retried: now,
+                        pause: RETRY_DELAY,
                         is_installed: true,
                     };
                     self.libraries.insert(id, library);
@@ -135,16 +137,33 @@ impl<P> Attachments<P> {
         }
     }
 
+    /// Returns whether no further library can be attached.
+    #[must_use]
+    pub fn is_full(&self) -> bool {
+        self.libraries.is_full()
+    }
+
     /// Attaches to new libraries, and detaches from libraries that have been unused for a while.
+    /// After some seconds of failed attempts, the remaining libraries wait for the next call.
     pub fn follow(&mut self, processes: &Processes, now: Instant, broker: &mut Broker) {
         for library in self.libraries.values_mut() {
             library.processes = 0;
         }
+        let began = Instant::now();
+        let mut failed = Duration::ZERO;
         for (process, used) in processes.using() {
             for mapped in &used.libraries {
-                self.attach_mapped(mapped, process, now, broker);
+                let now = now + began.elapsed();
+                if failed < FAILURE_TIME {
+                    failed += self.try_attach(mapped, process, now, broker);
+                }
+                if let Some(library) = self.libraries.get_mut(&mapped.id) {
+                    library.processes += 1;
+                    library.used = now;
+                }
             }
         }
+        let now = now + began.elapsed();
         self.libraries.retain(|_, library| {
             let is_used = library.is_installed || now - library.used < DETACH_DELAY;
             if !is_used && library.probe.is_ok() {
@@ -155,38 +174,62 @@ impl<P> Attachments<P> {
         });
     }
 
-    fn attach_mapped(&mut self, mapped: &Mapped, process: u32, now: Instant, broker: &mut Broker) {
+    /// Attaches to a library if an attempt is due. Returns the time that a failed attempt took.
+    fn try_attach(
+        &mut self,
+        mapped: &Mapped,
+        process: u32,
+        now: Instant,
+        broker: &mut Broker,
+    ) -> Duration {
         let Mapped { id, path, .. } = mapped;
-        let is_known = self
-            .libraries
-            .get(id)
-            .is_some_and(|known| known.probe.is_ok() || now - known.tried < RETRY_DELAY);
-        if !is_known && (self.libraries.contains_key(id) || !self.libraries.is_full()) {
-            let id = id.clone();
-            let probe = (self.attach)(broker, Place::Mapped { process, id });
-            let probe = probe.map_err(|refusal| Reason::of(&refusal));
-            let (library, is_new) = (path.display(), !self.libraries.contains_key(&mapped.id));
-            match &probe {
-                Ok(_) => tracing::info!(%library, "attached: {}", self.meaning),
-                Err(reason) if is_new => {
-                    tracing::warn!(%library, reason = reason.as_str(), "not attached");
-                }
-                Err(_) => {}
+        let known = self.libraries.get(id);
+        let is_due = match known {
+            Some(known) => known.probe.is_err() && now >= known.retried,
+            None => !self.libraries.is_full(),
+        };
+        if !is_due {
+            return Duration::ZERO;
+        }
+        let (earlier, processes) = known.map(|known| (known.pause, known.processes)).unzip();
+        let began = Instant::now();
+        let place = Place::Mapped {
+            process,
+            id: id.clone(),
+        };
+        let probe = (self.attach)(broker, place);
+        let spent = began.elapsed();
+        let pause = match (&probe, earlier) {
+            // Without a broker, nothing is known about the library.
+            (Err(Refusal::Broker(BrokerError::Refused(_))), Some(earlier)) => {
+                (earlier * 2).min(LONGEST_RETRY_DELAY)
             }
-            let library = Known {
-                path: path.clone(),
-                probe,
-                processes: 0,
-                used: now,
-                tried: now,
-                is_installed: false,
-            };
-            self.libraries.insert(mapped.id.clone(), library);
+            _ => RETRY_DELAY,
+        };
+        let probe = probe.map_err(|refusal| Reason::of(&refusal));
+        let library = path.display();
+        match &probe {
+            Ok(_) => tracing::info!(%library, "attached: {}", self.meaning),
+            Err(reason) if earlier.is_none() => {
+                tracing::warn!(%library, reason = reason.as_str(), "not attached");
+            }
+            Err(_) => {}
         }
-        if let Some(library) = self.libraries.get_mut(&mapped.id) {
-            library.processes += 1;
-            library.used = now;
-        }
+        let failed = match probe {
+            Ok(_) => Duration::ZERO,
+            Err(_) => spent,
+        };
+        let library = Known {
+            path: path.clone(),
+            probe,
+            processes: processes.unwrap_or_default(),
+            used: now,
+            retried: now + spent + pause,
+            pause,
+            is_installed: false,
+        };
+        self.libraries.insert(id.clone(), library);
+        failed
     }
 
     /// Returns facts about the libraries in use.
@@ -200,5 +243,75 @@ impl<P> Attachments<P> {
             refused: library.probe.as_ref().err().map(Reason::to_string),
         });
         libraries.collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+    use std::sync::atomic::{AtomicU32, Ordering};
+
+    use ros2probe_attach::mapped;
+
+    use super::*;
+
+    /// Attachments whose attempts take `time` each and are refused, and the number of attempts.
+    fn refused(time: Duration) -> (Attachments<()>, Arc<AtomicU32>) {
+        let attempts = Arc::<AtomicU32>::default();
+        let counter = Arc::clone(&attempts);
+        let attach: Attach<()> = Box::new(move |_, _| {
+            std::thread::sleep(time);
+            counter.fetch_add(1, Ordering::Relaxed);
+            Err(BrokerError::Refused("blocked".to_owned()).into())
+        });
+        (Attachments::new("", attach), attempts)
+    }
+
+    fn processes(libraries: u64) -> Processes {
+        let libraries = (1..=libraries).map(|inode| Mapped {
+            id: LibraryId {
+                device: "fe:00".to_owned(),
+                inode,
+            },
+            path: "/libtracetools.so".into(),
+            range: String::new(),
+        });
+        let used = mapped::Use {
+            libraries: libraries.collect(),
+            shares: false,
+        };
+        Processes::of(std::process::id(), used.into())
+    }
+
+    #[test]
+    fn libraries_that_are_slow_to_refuse_delay_the_caller_for_seconds_only() {
+        let (mut attachments, attempts) = refused(FAILURE_TIME * 2 / 3);
+        let (processes, broker) = (processes(4), &mut Broker::here());
+        attachments.follow(&processes, Instant::now(), broker);
+        assert_eq!(attempts.load(Ordering::Relaxed), 2);
+        // The first two have paused for less than their time since they were refused.
+        attachments.follow(&processes, Instant::now(), broker);
+        assert_eq!(attempts.load(Ordering::Relaxed), 4);
+        assert_eq!(attachments.facts().len(), 4);
+    }
+
+    #[test]
+    fn the_pause_after_a_refusal_doubles_up_to_a_few_minutes() {
+        let (mut attachments, attempts) = refused(Duration::ZERO);
+        let (processes, broker, start) = (processes(1), &mut Broker::here(), Instant::now());
+        let mut times = Vec::new();
+        for second in 0..1200 {
+            let before = attempts.load(Ordering::Relaxed);
+            let now = start + Duration::from_millis(1000 * second);
+            attachments.follow(&processes, now, broker);
+            if attempts.load(Ordering::Relaxed) != before {
+                times.push(second);
+            }
+        }
+        let pauses: Vec<_> = times.windows(2).map(|pair| pair[1] - pair[0]).collect();
+        let expected = [5, 10, 20, 40, 80, 160, 320, 320];
+        let is_near = |(pause, expected): (&u64, &u64)| pause.abs_diff(*expected) <= 1;
+        assert_eq!(pauses.len(), expected.len(), "{pauses:?}");
+        assert!(pauses.iter().zip(&expected).all(is_near), "{pauses:?}");
     }
 }

@@ -7,6 +7,7 @@
 //! every message passed to the transport, even if a full port or segment then refuses it.
 
 pub mod attachments;
+pub mod library_id;
 pub mod processes;
 pub mod search;
 

@@ -81,7 +81,7 @@ impl Processes {
 
     /// Creates a set with one process.
     #[cfg(test)]
-    pub(super) fn of(process: u32, use_of_it: Use) -> Self {
+    pub(crate) fn of(process: u32, use_of_it: Use) -> Self {
         let known = Process {
             rounds: 1,
             library_use: use_of_it,

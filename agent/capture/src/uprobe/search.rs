@@ -455,7 +455,10 @@ fn uncovered(attachments: &Attachments<Attached>, processes: &Processes) -> Opti
             match attachments.probe(id) {
                 Some(Ok(_)) => {}
                 Some(Err(reason)) => return Some(format!("{path}: {reason}")),
-                None => return Some(format!("{path}: too many libraries are in use")),
+                None if attachments.is_full() => {
+                    return Some(format!("{path}: too many libraries are in use"));
+                }
+                None => return Some(format!("{path}: not attached yet")),
             }
         }
     }

@@ -4,6 +4,7 @@ mod deliveries;
 mod handoffs;
 mod kernel_trace;
 mod late;
+mod overlays;
 mod thread_states;
 
 use std::fs::File;
@@ -18,7 +19,7 @@ use ros2probe_capture::filter::Deliveries;
 use ros2probe_capture::inside::programs::{self, Attached, Events, Programs, Tables};
 use ros2probe_capture::inside::table::{MAX_PROCESS_HITS, ProcessTable, Round};
 use ros2probe_capture::system::Clocks;
-use ros2probe_model::facts::calls::report::{ProcessReport, Trigger};
+use ros2probe_model::facts::calls::report::{Durations, ProcessReport, Trigger};
 use ros2probe_testing::harness::traced_program::TracedProgram;
 use ros2probe_wire::inside::{Counter, HANDLE_CAPACITY, HOPS_PER_SECOND};
 
@@ -85,6 +86,10 @@ impl Robot {
 
     /// Reads the tables as if this time had passed since the last round.
     fn round_after(&mut self, elapsed: Duration) -> Round {
+        self.round_with(&mut Broker::here(), elapsed)
+    }
+
+    fn round_with(&mut self, broker: &mut Broker, elapsed: Duration) -> Round {
         let shows = self
             .attached
             .as_ref()
@@ -95,7 +100,7 @@ impl Robot {
             &mut self.tables,
             &clocks,
             elapsed,
-            &mut Broker::here(),
+            broker,
             |_| shows,
             |call| deliveries?.of(call),
         )
@@ -204,6 +209,22 @@ fn messages_of_a_process_older_than_the_probes_are_counted_and_named() {
         let again = robot.report(&process);
         assert!(again.publishers.is_empty() && again.subscriptions.is_empty());
     }
+}
+
+#[test]
+fn a_process_has_its_domain_and_name_once_the_broker_answers() {
+    let mut robot = Robot::new(248, &[], false);
+    robot.attach();
+    let mut process = robot.start();
+    process.run("publish 5");
+    let mut absent = Broker::at(Path::new("/nonexistent/broker.sock"));
+    let reports = robot.round_with(&mut absent, Duration::from_secs(1)).report;
+    let report = &reports.processes[0];
+    assert_eq!((report.domain_id.0, &report.name), (0, &None));
+    assert_eq!(report.cpu, None);
+    let report = robot.report(&process);
+    assert_eq!(report.domain_id.0, 7);
+    assert!(report.cpu.is_some() && report.name.is_some());
 }
 
 #[test]
@@ -530,6 +551,52 @@ fn a_process_beyond_its_budget_is_no_longer_counted_until_it_slows_down() {
         robot.report(&process).publishers[0].published,
         MAX_PROCESS_HITS + 6
     );
+}
+
+#[test]
+fn the_budget_applies_before_announcements_are_read() {
+    let mut robot = Robot::new(248, &[], true);
+    robot.attach();
+    let mut process = robot.start();
+    let over = Duration::from_millis(500);
+    process.run(&format!("publish {}", MAX_PROCESS_HITS));
+    let tables = &mut robot.tables;
+    let hits = (robot.table).apply_budgets(tables, over, &mut Broker::here());
+    assert!(hits >= 2 * MAX_PROCESS_HITS, "{hits}");
+    process.run("transition");
+    assert_eq!(robot.counter(Counter::Suspended), 1);
+    assert!(robot.round().report.transitions.is_empty());
+}
+
+#[test]
+fn no_call_or_interval_after_a_suspension_includes_it() {
+    let mut robot = Robot::new(248, &[], true);
+    robot.attach();
+    let mut process = robot.start();
+    process.run("init");
+    process.run("take 1");
+    process.run(&format!("publish {}", MAX_PROCESS_HITS + 1));
+    // One callback begins before the suspension, and the next one during it.
+    let pause = Duration::from_millis(150);
+    for is_suspended in [true, false] {
+        process.begin("take 1 300000");
+        std::thread::sleep(pause);
+        assert_eq!(robot.report(&process).is_suspended, is_suspended);
+        process.end("take");
+        if is_suspended {
+            std::thread::sleep(2 * pause);
+        }
+    }
+    process.run("take 1");
+    let report = robot.report(&process);
+    let callback = &report.callbacks[0];
+    let longest = |durations: &Durations| durations.range().unwrap().1;
+    assert_eq!(callback.calls, 2, "the other two were not observed whole");
+    assert!(longest(&callback.durations) < pause, "{callback:?}");
+    let publisher = &report.publishers[0];
+    assert!(longest(&publisher.intervals) < 3 * pause, "{publisher:?}");
+    let subscription = &report.subscriptions[0];
+    assert!(longest(&subscription.intervals) < 3 * pause);
 }
 
 #[test]

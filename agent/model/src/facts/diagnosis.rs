@@ -172,7 +172,7 @@ pub enum Diagnosis {
         stage: Stage,
         /// What made them late.
         cause: Cause,
-        /// Thread that ran instead or held the lock, in the longest of the last calls.
+        /// Thread that ran instead or held the lock, in the longest of these calls.
         by: Option<ThreadLabel>,
         /// Time from ready to the end of that call.
         longest: Duration,

@@ -88,6 +88,15 @@ impl Alarm {
         }
     }
 
+    /// Replaces the value of a finding, and returns whether there is one.
+    pub(super) const fn restate(&mut self, value: (u64, u64)) -> bool {
+        let is_raised = self.raised.is_some();
+        if is_raised {
+            self.raised = Some(value);
+        }
+        is_raised
+    }
+
     /// Returns the finding's value, and the value with which it is compared.
     pub(super) const fn raised(&self) -> Option<(u64, u64)> {
         self.raised

@@ -49,6 +49,8 @@ struct Lateness {
     longest: Bounded<LongestLateCalls, Vec<Arc<LateExample>>>,
     latest: Bounded<LastLateCalls, VecDeque<Arc<LateExample>>>,
     alarm: Alarm,
+    /// The stage and cause of the alarm.
+    alarm_cause: Option<(Stage, Cause)>,
 }
 
 /// What a finding says about a callback.
@@ -60,8 +62,8 @@ pub(super) struct Late<'a> {
     pub(super) calls: u64,
     pub(super) stage: Stage,
     pub(super) cause: Cause,
-    /// The longest of the last ones.
-    pub(super) example: &'a LateExample,
+    /// The longest of them.
+    pub(super) longest: &'a LateEntry,
 }
 
 impl LateCalls {
@@ -94,10 +96,7 @@ impl LateCalls {
     pub(super) fn judge(&mut self, at: ModelTime) -> bool {
         let mut has_changed = false;
         for lateness in self.callbacks.values_mut() {
-            let found = lateness
-                .most_frequent_cause(at)
-                .map(|(_, calls)| (calls, 0));
-            has_changed |= lateness.alarm.judge(found);
+            has_changed |= lateness.judge(at);
         }
         has_changed
     }
@@ -109,21 +108,17 @@ impl LateCalls {
             Some((lateness, calls))
         });
         raised.filter_map(move |(lateness, calls)| {
-            let ((stage, cause), _) = lateness
-                .most_frequent_cause(at)
-                .or_else(|| lateness.last())?;
-            let of_cause = |example: &&Arc<LateExample>| {
-                let main = example.main.as_ref();
-                main.is_some_and(|main| (main.stage, main.cause) == (stage, cause))
-            };
-            let latest = lateness.latest.iter().filter(of_cause);
+            let (stage, cause) = lateness.alarm_cause?;
+            let entries = lateness.history.iter();
+            let of_cause = entries.filter(|entry| (entry.stage, entry.cause) == (stage, cause));
             Some(Late {
                 owner: &lateness.owner,
                 trigger: &lateness.trigger,
                 calls,
                 stage,
                 cause,
-                example: latest.max_by_key(|example| example.call.total())?,
+                // The finding remains for some seconds after the window.
+                longest: of_cause.max_by_key(|entry| (at - entry.at < WINDOW, entry.total))?,
             })
         })
     }
@@ -152,6 +147,7 @@ impl Lateness {
             longest: Bounded::default(),
             latest: Bounded::default(),
             alarm: Alarm::default(),
+            alarm_cause: None,
         }
     }
 
@@ -206,23 +202,39 @@ impl Lateness {
         self.longest.push(example);
     }
 
-    /// Returns the most frequent cause of the window that ends at `at`, and its late calls; `None`
-    /// if they are few.
-    fn most_frequent_cause(&self, at: ModelTime) -> Option<((Stage, Cause), u64)> {
+    /// Evaluates the rule at `at`. A finding keeps its cause while that cause alone violates the
+    /// rule. Returns whether the finding appeared, ended or changed.
+    fn judge(&mut self, at: ModelTime) -> bool {
+        let is_raised = self.alarm.raised().is_some();
+        let kept = self.alarm_cause.filter(|_| is_raised);
+        let found = self.most_frequent_cause(at, kept);
+        let mut has_changed = false;
+        if let Some((cause, calls)) = found
+            && self.alarm_cause != Some(cause)
+        {
+            self.alarm_cause = Some(cause);
+            has_changed = self.alarm.restate((calls, 0));
+        }
+        self.alarm.judge(found.map(|(_, calls)| (calls, 0))) || has_changed
+    }
+
+    /// Returns the most frequent cause of the window that ends at `at`, or `kept` if its late calls
+    /// suffice, and the late calls of this cause; `None` if they are few.
+    fn most_frequent_cause(
+        &self,
+        at: ModelTime,
+        kept: Option<(Stage, Cause)>,
+    ) -> Option<((Stage, Cause), u64)> {
         let recent = self.history.iter().rev();
         let recent = recent.take_while(|entry| at - entry.at < WINDOW);
         let mut counts: BTreeMap<(Stage, Cause), usize> = BTreeMap::new();
         for entry in recent {
             *counts.entry((entry.stage, entry.cause)).or_default() += 1;
         }
-        let (cause, calls) = counts.into_iter().max_by_key(|(_, calls)| *calls)?;
-        (calls >= MIN_LATE_CALLS).then_some((cause, calls as u64))
-    }
-
-    /// Returns the cause of the last late call.
-    fn last(&self) -> Option<((Stage, Cause), u64)> {
-        let entry = self.history.back()?;
-        Some(((entry.stage, entry.cause), 1))
+        counts.retain(|_, calls| *calls >= MIN_LATE_CALLS);
+        let rank = |(cause, calls): &(_, usize)| (kept == Some(*cause), *calls);
+        let (cause, calls) = counts.into_iter().max_by_key(rank)?;
+        Some((cause, calls as u64))
     }
 
     fn facts(&self) -> LateCallback {

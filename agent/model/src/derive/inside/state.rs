@@ -20,7 +20,6 @@ use crate::facts::calls::facts::{
     InsideFacts, LifecycleState, NewLateCalls, ObservedProcess, TopicInside,
 };
 use crate::facts::calls::late::LateCall;
-use crate::facts::calls::other_thread::OtherThread;
 use crate::facts::calls::report::{ProcessReport, Report, ThreadStates, Transition, Trigger};
 use crate::facts::diagnosis::Diagnosis;
 use crate::facts::measurement::Measurement;
@@ -71,9 +70,9 @@ pub(super) struct Process {
     reported_domain_id: DomainId,
     /// Nodes that it created while it was observed.
     reported: Bounded<ReportedNodes, Vec<NodeName>>,
-    cpu: Duration,
+    cpu: Option<Duration>,
     /// The earlier and the later start of a window: time, CPU time and calls.
-    marks: [(ModelTime, Duration, u64); 2],
+    marks: [(ModelTime, Option<Duration>, u64); 2],
     pub(super) handles: Bounded<InsideHandles, BTreeMap<(Kind, u64), Tracked>>,
     /// Queues of its subscriptions.
     pub(super) queues: BTreeMap<(DomainId, TopicName), ReaderQueue>,
@@ -322,8 +321,11 @@ impl Inside {
         facts.refused = report.refused;
         facts.is_suspended = report.is_suspended;
         facts.shows_intra_process |= report.shows_intra_process;
-        process.cpu = report.cpu;
-        process.reported_domain_id = report.domain_id;
+        process.cpu = report.cpu.or(process.cpu);
+        if process.reported_domain_id != report.domain_id {
+            process.reported_domain_id = report.domain_id;
+            self.graph = None;
+        }
         for node in report.nodes {
             if !process.reported.contains(&node) && process.reported.push(node).is_none() {
                 self.graph = None;
@@ -603,8 +605,6 @@ impl Inside {
     fn late_finding(&self, late: &Late<'_>) -> Diagnosis {
         let name = late.trigger.name().map(TopicName::from);
         let topic = name.and_then(|name| self.topics.get(late.owner.domain_id, &name));
-        let call = &late.example.call;
-        let by = late.example.main.and_then(|part| call.named_by(part));
         Diagnosis::LateCallback {
             topic: topic.map(|topic| topic.key(late.owner.domain_id)),
             callback: late.owner.clone(),
@@ -612,8 +612,8 @@ impl Inside {
             calls: late.calls,
             stage: late.stage,
             cause: late.cause,
-            by: by.map(OtherThread::label),
-            longest: call.total(),
+            by: late.longest.by.clone(),
+            longest: late.longest.total,
         }
     }
 
@@ -630,7 +630,9 @@ impl Process {
         let [(begin, cpu, calls), (middle, ..)] = self.marks;
         let span = (at - begin).as_secs_f64();
         if span > 0.0 {
-            self.facts.cpu = Some(self.cpu.saturating_sub(cpu).as_secs_f64() / span);
+            let both = self.cpu.zip(cpu);
+            let spent = both.map(|(end, begin)| end.saturating_sub(begin).as_secs_f64());
+            self.facts.cpu = spent.map(|spent| spent / span);
             let hits = self.facts.calls.saturating_sub(calls);
             self.facts.calls_hz = ratio(hits, 1).map(|hits| hits / span);
         }

@@ -35,8 +35,8 @@ pub struct ProcessReport {
     pub name: Option<Arc<str>>,
     /// Its domain, from `ROS_DOMAIN_ID` of its environment.
     pub domain_id: DomainId,
-    /// CPU time so far, user and system.
-    pub cpu: Duration,
+    /// CPU time so far, user and system; `None` until it was read.
+    pub cpu: Option<Duration>,
     /// Calls observed.
     pub hits: u64,
     /// Calls that were not counted because there were too many handles.

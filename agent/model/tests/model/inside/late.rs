@@ -491,7 +491,17 @@ fn the_thread_that_ran_instead_and_the_holder_of_a_lock_are_named() {
 
 /// Reports late calls at a second.
 fn report(observer: &mut Observer, second: u64, calls: u32) {
+    report_all(observer, second, calls, 0);
+}
+
+/// Reports late calls at a second: those whose thread waited for a CPU, and then those that
+/// computed.
+fn report_all(observer: &mut Observer, second: u64, calls: u32, computing: u32) {
     let at = Timestamp(START + second * SECOND);
+    let computing = (0..computing).map(|_| LateCall {
+        started: at,
+        ..call(states(100, 0, 0, 0))
+    });
     let late = (0..calls).map(|number| {
         let mut late = call(states(10, 0, 90, 0));
         late.started = at;
@@ -509,7 +519,7 @@ fn report(observer: &mut Observer, second: u64, calls: u32) {
             ..ProcessReport::default()
         }],
         transitions: Vec::new(),
-        late: late.collect(),
+        late: late.chain(computing).collect(),
     }));
     observer.input(Input::Time(at));
 }
@@ -556,6 +566,37 @@ fn three_late_calls_in_a_minute_are_a_finding_with_the_cause_until_the_minute_is
         report(&mut observer, second, 0);
     }
     assert_eq!(late_findings(&mut observer, 89), []);
+}
+
+#[test]
+fn a_finding_keeps_its_cause_and_calls_while_calls_with_another_cause_follow() {
+    let mut observer = Observer::new(Settings::default());
+    let facts = |observer: &mut Observer, second| {
+        let found = late_findings(observer, second);
+        let [finding] = &found[..] else {
+            panic!("{found:?} after {second} s");
+        };
+        let Diagnosis::LateCallback {
+            calls, cause, by, ..
+        } = finding
+        else {
+            panic!("{finding:?}");
+        };
+        (*calls, *cause, by.is_some())
+    };
+    report_all(&mut observer, 0, 3, 0);
+    for second in 1..55 {
+        // All calls that are kept with their parts compute.
+        report_all(&mut observer, second, 0, u32::from(second < 13));
+        if second > 3 {
+            assert_eq!(facts(&mut observer, second), (3, Cause::Runnable, true));
+        }
+    }
+    // Those of the first cause are older than a minute.
+    for second in 55..65 {
+        report_all(&mut observer, second, 0, 0);
+    }
+    assert_eq!(facts(&mut observer, 64), (12, Cause::Cpu, false));
 }
 
 #[test]

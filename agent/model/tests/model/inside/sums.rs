@@ -5,6 +5,27 @@ use ros2probe_model::facts::event::EventKind;
 use super::*;
 
 #[test]
+fn the_domain_and_the_cpu_time_of_a_process_count_from_the_report_that_has_them() {
+    let mut world = World::new();
+    for second in 1..=20 {
+        let mut report = process(70);
+        report.publishers = vec![publisher("/scan", 20 * second, world.now)];
+        if second > 3 {
+            // It ran for an hour before it was observed.
+            report.domain_id = DomainId(3);
+            report.cpu = Some(Duration::from_secs(3600) + Duration::from_millis(100 * second));
+        }
+        world.second(vec![report]);
+        let facts = &world.snapshot().inside.unwrap().processes[0];
+        let domain_id = DomainId(if second > 3 { 3 } else { 0 });
+        assert_eq!(facts.domain_id, domain_id, "second {second}");
+        let is_usual = |cpu: f64| (cpu - 0.1).abs() < 0.01;
+        assert!(facts.cpu.is_none_or(is_usual), "{:?}", facts.cpu);
+        assert!(second < 16 || facts.cpu.is_some(), "second {second}");
+    }
+}
+
+#[test]
 fn a_topic_without_datagrams_appears_with_its_rate_and_ends_with_its_process() {
     let mut world = World::new();
     for second in 1..=12 {
