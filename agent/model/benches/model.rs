@@ -27,8 +27,13 @@ fn guid(index: u16) -> Guid {
     Guid::new(ALICE, EntityId([0, high, low, 3]))
 }
 
-/// Returns an observer of one participant with this many measured writers.
+/// Returns an observer of one participant with this many measured writers, each of its own topic.
 fn observer(writers: u16) -> Observer {
+    sharing(writers, writers)
+}
+
+/// Returns an observer of one participant with this many measured writers of this many topics.
+fn sharing(writers: u16, topics: u16) -> Observer {
     let mut observer = Observer::new(Settings::default());
     observer.input(Input::Watchlist(Arc::new(
         Watchlist::new(vec![Watch::named("/**").unwrap()]).unwrap(),
@@ -45,15 +50,15 @@ fn observer(writers: u16) -> Observer {
     for index in 0..writers {
         observer.input(Input::Datagram {
             envelope: &envelope,
-            payload: &sedp(index),
+            payload: &sedp(index, index % topics),
             handover: None,
         });
     }
     observer
 }
 
-fn sedp(index: u16) -> Vec<u8> {
-    let payload = forge::endpoint(guid(index), &format!("rt/topic_{index}"), IMAGE, true);
+fn sedp(index: u16, topic: u16) -> Vec<u8> {
+    let payload = forge::endpoint(guid(index), &format!("rt/topic_{topic}"), IMAGE, true);
     Message::from(ALICE)
         .data(SEDP_WRITERS, index.into(), &payload)
         .bytes()
@@ -189,7 +194,7 @@ fn discovery(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("discovery");
     let envelope = forge::multicast(START, 0);
     group.bench_function("new endpoint", |bencher| {
-        let announcements: Vec<_> = (0..1000).map(sedp).collect();
+        let announcements: Vec<_> = (0..1000).map(|index| sedp(index, index)).collect();
         bencher.iter_batched(
             || observer(0),
             |mut world| {
@@ -206,7 +211,7 @@ fn discovery(criterion: &mut Criterion) {
         );
     });
     let mut world = observer(1000);
-    let again = sedp(500);
+    let again = sedp(500, 500);
     group.bench_function("known endpoint", |bencher| {
         bencher.iter(|| {
             world.input(Input::Datagram {
@@ -232,6 +237,44 @@ fn housekeeping(criterion: &mut Criterion) {
     group.bench_function("snapshot", |bencher| {
         bencher.iter(|| black_box(world.snapshot(Timestamp(now))));
     });
+    group.finish();
+}
+
+/// One second of a robot with a thousand topics of five writers each, of which the first `sending`
+/// writers send ten messages. The host hook reports each at one socket.
+fn seconds(criterion: &mut Criterion) {
+    let mut group = criterion.benchmark_group("a second of a thousand topics");
+    group.sample_size(20);
+    for (name, sending) in [("idle", 0), ("1000 writers at 10 Hz", 1000)] {
+        let mut world = sharing(5000, 1000);
+        let (mut now, mut number) = (START, 0);
+        let mut pass = |sending: u16| {
+            for _ in 0..10 {
+                number += 1;
+                for writer in 0..sending {
+                    let record = Record {
+                        kind: kind::DATA,
+                        submessage_flags: 5,
+                        writer: guid_words(guid(writer)),
+                        time: now + u64::from(writer) * 10_000,
+                        sequence_number: number,
+                        payload_len: 324,
+                        source_timestamp: 1_795_143_000 << 32,
+                        destination_port: 7411,
+                        flags: flag::HOST,
+                        socket: 1,
+                        ..Record::default()
+                    };
+                    observe(&mut world, &record);
+                }
+                now += 100_000_000;
+                world.input(Input::Time(Timestamp(now)));
+            }
+        };
+        pass(5000);
+        (0..20).for_each(|_| pass(sending));
+        group.bench_function(name, |bencher| bencher.iter(|| pass(black_box(sending))));
+    }
     group.finish();
 }
 
@@ -264,6 +307,7 @@ criterion_group!(
     deliveries,
     discovery,
     housekeeping,
+    seconds,
     captures
 );
 criterion_main!(benches);

@@ -120,6 +120,12 @@ impl RecentLoss {
         }
     }
 
+    /// Returns whether all seconds are empty and stay so while the counters are as `now`.
+    #[must_use]
+    pub fn is_quiet(&self, now: LossShare) -> bool {
+        self.before == now && self.seconds.iter().all(|second| *second == (0, 0))
+    }
+
     /// Adds the seconds and counters of `other`.
     pub fn absorb(&mut self, other: &Self) {
         self.before.add(other.before);

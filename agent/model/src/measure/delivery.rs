@@ -366,6 +366,20 @@ impl Delivery {
         self.undelivered.expire(now);
     }
 
+    /// Returns the time from which [`Self::advance`] or [`Self::expect`] has an effect without an
+    /// observation; [`ModelTime::MAX`] if never. `reliable` is that of the context.
+    #[must_use]
+    pub fn next_due(&self, reliable: bool) -> ModelTime {
+        if self.waiting.is_some() {
+            // Signs of life of the receiver decide.
+            return ModelTime::ZERO;
+        }
+        let window = settle_window(reliable && !self.best_effort);
+        let reception = self.reception.next_due((window, BEST_EFFORT_WINDOW));
+        let causes = self.loss_causes.next_due();
+        reception.min(causes).min(self.undelivered.next_expiry())
+    }
+
     /// Settles all samples, including pending ones: the input has ended.
     pub fn settle(&mut self, context: &mut DeliveryContext<'_>) {
         let (reception, budget, mut accounting) = self.split(context);

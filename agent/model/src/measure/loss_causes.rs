@@ -148,6 +148,13 @@ impl LossCauses {
         due
     }
 
+    /// Returns the time at which the next run is due; [`ModelTime::MAX`] without one.
+    #[must_use]
+    pub fn next_due(&self) -> ModelTime {
+        let times = self.pending.values().map(|run| run.until);
+        times.min().unwrap_or(ModelTime::MAX)
+    }
+
     /// Merges the causes of `other`.
     pub fn absorb(&mut self, other: Self) {
         for (number, known_loss) in other.known {

@@ -71,6 +71,8 @@ pub struct Measured {
     unacknowledged: bool,
     /// Time at which the kernel begins to capture all fragments of the writer.
     complete_from: ModelTime,
+    /// A tick from this time on visits the writer.
+    due: ModelTime,
 }
 
 /// All measured writers.
@@ -80,6 +82,10 @@ pub struct Profiler {
     unknown_writers: Bounded<bounded::Counted<tables::UnknownWriters>, BTreeSet<Guid>>,
     shared: SharedBudgets,
     search_after: ModelTime,
+    /// No writer is due before this time.
+    earliest: ModelTime,
+    /// Generation of the receivers at the last tick.
+    generation: u64,
 }
 
 /// Budgets that all writers share.
@@ -143,6 +149,8 @@ impl Profiler {
                 },
             },
             search_after: ModelTime::ZERO,
+            earliest: ModelTime::MAX,
+            generation: 0,
         }
     }
 
@@ -215,6 +223,7 @@ impl Profiler {
         let Some(measured) = self.writers.get_mut(&guid) else {
             return ObservationOutcome::Unmeasured;
         };
+        (measured.due, self.earliest) = (ModelTime::ZERO, ModelTime::ZERO);
         measured.last_seen = measured.last_seen.max(now);
         if measured.topic.is_none() && !measured.metered {
             // The kernel filter may omit samples beyond its budget for unknown writers, so a gap is
@@ -308,6 +317,7 @@ impl Profiler {
         now: ModelTime,
     ) {
         if let Some(known) = self.writers.get_mut(&guid) {
+            (known.due, self.earliest) = (ModelTime::ZERO, ModelTime::ZERO);
             known.writer.learn(traits);
             known.opened = known.opened.max(opened);
             if known.topic.is_none() {
@@ -353,6 +363,7 @@ impl Profiler {
     /// Updates the properties of a writer from discovery.
     pub fn learn(&mut self, guid: Guid, traits: Traits) {
         if let Some(measured) = self.writers.get_mut(&guid) {
+            (measured.due, self.earliest) = (ModelTime::ZERO, ModelTime::ZERO);
             measured.writer.learn(traits);
         }
     }
@@ -404,8 +415,19 @@ impl Profiler {
         })
     }
 
-    /// Settles the samples for which the settle window is over. Returns the changes of unknown
-    /// writers.
+    /// Returns the time from which [`Self::advance`] has an effect without an observation:
+    /// [`ModelTime::ZERO`] for the next tick, [`ModelTime::MAX`] if never.
+    #[must_use]
+    pub fn next_due(&self, graph: &Graph) -> ModelTime {
+        let has_changed = self.generation != graph.receivers.generation();
+        match has_changed || self.shared.quota.wanted {
+            true => ModelTime::ZERO,
+            false => self.earliest,
+        }
+    }
+
+    /// Settles the samples for which the settle window is over. Visits only writers that are due,
+    /// or all after a change of receivers. Returns the changes of unknown writers.
     pub fn advance(
         &mut self,
         now: ModelTime,
@@ -413,28 +435,21 @@ impl Profiler {
         graph: &Graph,
     ) -> UnknownWriters {
         let mut unknown_writers = UnknownWriters::default();
-        for (guid, measured) in &mut self.writers {
-            let writer_ref = measured.writer_ref(*guid);
-            measured
-                .writer
-                .advance(&mut self.shared.measurement_context(
-                    writer_ref,
-                    now,
-                    journal,
-                    graph.wall_clock,
-                ));
-            if measured.topic.is_some() {
-                if let Some(subscribers) = &mut measured.subscribers {
-                    subscribers
-                        .advance(&mut self.shared.writer_context(writer_ref, now, journal, graph));
+        let generation = graph.receivers.generation();
+        if std::mem::replace(&mut self.generation, generation) != generation {
+            self.visit_all();
+        }
+        if self.earliest <= now {
+            self.earliest = ModelTime::MAX;
+            for (guid, measured) in &mut self.writers {
+                if measured.due <= now {
+                    self.shared.advance((*guid, measured), now, journal, graph);
+                    if measured.topic.is_none() {
+                        unknown_writers.advance((*guid, measured), now);
+                    }
+                    measured.due = measured.next_due(now);
                 }
-                continue;
-            }
-            if measured.last_seen + UNKNOWN_WRITER_TIMEOUT <= now {
-                unknown_writers.forgotten.push(*guid);
-            } else if !measured.metered && measured.first_seen + UNKNOWN_AFTER <= now {
-                (measured.metered, measured.opened) = (true, now);
-                unknown_writers.metered.push(*guid);
+                self.earliest = self.earliest.min(measured.due);
             }
         }
         unknown_writers.metered.sort_unstable();
@@ -460,6 +475,14 @@ impl Profiler {
         }
     }
 
+    /// Makes the next tick visit every writer.
+    pub fn visit_all(&mut self) {
+        self.earliest = ModelTime::ZERO;
+        for measured in self.writers.values_mut() {
+            measured.due = ModelTime::ZERO;
+        }
+    }
+
     /// Settles all samples at the end of the input.
     pub fn settle(&mut self, now: ModelTime, journal: &mut Journal, graph: &Graph) {
         let mut guids: Vec<_> = self.writers.keys().copied().collect();
@@ -468,6 +491,7 @@ impl Profiler {
             let Some(measured) = self.writers.get_mut(&guid) else {
                 continue;
             };
+            (measured.due, self.earliest) = (ModelTime::ZERO, ModelTime::ZERO);
             let writer_ref = measured.writer_ref(guid);
             measured.writer.settle(&mut self.shared.measurement_context(
                 writer_ref,
@@ -499,6 +523,7 @@ impl Profiler {
             let Some(measured) = self.writers.get_mut(&guid) else {
                 continue;
             };
+            (measured.due, self.earliest) = (ModelTime::ZERO, ModelTime::ZERO);
             let writer_ref = measured.writer_ref(guid);
             if let Some(subscribers) = &mut measured.subscribers {
                 let mut context = self.shared.writer_context(writer_ref, now, journal, graph);
@@ -509,6 +534,28 @@ impl Profiler {
 }
 
 impl SharedBudgets {
+    /// Settles the samples of a writer for which the settle window is over.
+    fn advance(
+        &mut self,
+        (guid, measured): (Guid, &mut Measured),
+        now: ModelTime,
+        journal: &mut Journal,
+        graph: &Graph,
+    ) {
+        let writer_ref = measured.writer_ref(guid);
+        measured.writer.advance(&mut self.measurement_context(
+            writer_ref,
+            now,
+            journal,
+            graph.wall_clock,
+        ));
+        if measured.topic.is_some()
+            && let Some(subscribers) = &mut measured.subscribers
+        {
+            subscribers.advance(&mut self.writer_context(writer_ref, now, journal, graph));
+        }
+    }
+
     fn measurement_context<'a>(
         &'a mut self,
         writer_ref: WriterRef,
@@ -585,7 +632,20 @@ impl Measured {
             opened: ModelTime::ZERO,
             unacknowledged: false,
             complete_from: ModelTime::ZERO,
+            due: ModelTime::MAX,
         }
+    }
+
+    /// Returns the time of the next decision without an observation, after the tick at `now`;
+    /// [`ModelTime::MAX`] without one.
+    fn next_due(&self, now: ModelTime) -> ModelTime {
+        let own = self.writer.next_due();
+        own.min(match (self.topic, &self.subscribers) {
+            (None, _) if self.metered => self.last_seen + UNKNOWN_WRITER_TIMEOUT,
+            (None, _) => self.first_seen + UNKNOWN_AFTER,
+            (Some(_), Some(known)) => known.next_due(self.writer.traits().reliable, now),
+            (Some(_), None) => ModelTime::MAX,
+        })
     }
 
     /// Allows samples to lack fragments until the kernel knows the writer.

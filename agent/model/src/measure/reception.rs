@@ -272,6 +272,14 @@ impl Reception {
         samples.expire(now, 2 * window, budget);
     }
 
+    /// Returns the time from which [`Self::advance`] has an effect without an observation;
+    /// [`ModelTime::MAX`] if never.
+    #[must_use]
+    pub fn next_due(&self, (window, grace): (Duration, Duration)) -> ModelTime {
+        let numbers = self.sequence.next_due((window, grace));
+        numbers.min(self.samples.next_expiry(2 * window))
+    }
+
     /// Decides all samples at the end of the input.
     pub fn settle(&mut self, budget: &mut Budget, decide: &mut impl FnMut(Decision)) {
         let Self { sequence, samples } = self;

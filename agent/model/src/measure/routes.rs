@@ -228,6 +228,14 @@ impl KnownRoute {
         }
     }
 
+    /// Returns the time from which [`Self::mark`] remembers this number; [`ModelTime::MAX`] if it
+    /// is remembered.
+    #[must_use]
+    pub fn next_mark(&self, number: SequenceNumber) -> ModelTime {
+        let last = self.left.back().filter(|(_, last)| *last != number);
+        last.map_or(ModelTime::MAX, |(at, _)| *at + DEPARTURE_INTERVAL)
+    }
+
     /// Returns the highest number that had left by this time.
     #[must_use]
     pub fn departed_by(&self, at: ModelTime) -> Option<SequenceNumber> {

@@ -238,6 +238,14 @@ impl Samples {
         expired
     }
 
+    /// Returns the time at which [`Self::expire`] drops the next sample; [`ModelTime::MAX`] without
+    /// one.
+    #[must_use]
+    pub fn next_expiry(&self, window: Duration) -> ModelTime {
+        let latest = self.partial.iter().map(|each| each.latest).min();
+        latest.map_or(ModelTime::MAX, |latest| latest + window)
+    }
+
     /// Moves the memory of unfinished samples from one budget to another.
     pub fn transfer(&self, from: &mut Budget, to: &mut Budget) {
         let bytes: usize = self.partial.iter().map(|each| each.bitmap.len() * 8).sum();

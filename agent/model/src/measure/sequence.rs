@@ -415,6 +415,22 @@ impl Sequence {
         }
     }
 
+    /// Returns the time from which [`Self::advance`] has an effect without an observation;
+    /// [`ModelTime::MAX`] if never.
+    #[must_use]
+    pub fn next_due(&self, (window, grace): (Duration, Duration)) -> ModelTime {
+        let withdrawn = self.withdrawn.map(|(at, _)| at + grace);
+        let settled = self.checkpoints.front().map(|(at, _)| *at + window);
+        let is_open = self.started() && self.settled < self.next;
+        let noted = match self.checkpoints.back() {
+            Some((_, next)) if *next >= self.next => None,
+            Some((at, _)) => Some(*at + window / STEPS),
+            None => Some(ModelTime::ZERO),
+        };
+        let times = [withdrawn, settled, noted.filter(|_| is_open)];
+        times.into_iter().flatten().min().unwrap_or(ModelTime::MAX)
+    }
+
     /// Decides all open numbers.
     pub fn settle_all(&mut self, settled: &mut impl FnMut(Settled)) {
         self.settle(self.next, settled);

@@ -117,6 +117,14 @@ impl Undelivered {
         parts.into_iter().map(part).collect()
     }
 
+    /// Returns the time at which [`Self::expire`] removes the next entry; [`ModelTime::MAX`]
+    /// without one.
+    #[must_use]
+    pub fn next_expiry(&self) -> ModelTime {
+        let oldest = self.waiting.front();
+        oldest.map_or(ModelTime::MAX, |oldest| oldest.last + LIFETIME)
+    }
+
     /// Removes entries whose arrival did not follow.
     pub fn expire(&mut self, now: ModelTime) {
         while let Some(oldest) = self.waiting.front()

@@ -413,6 +413,18 @@ impl Writer {
         });
     }
 
+    /// Returns the time from which [`Self::advance`] has an effect without an observation;
+    /// [`ModelTime::MAX`] if never.
+    #[must_use]
+    pub fn next_due(&self) -> ModelTime {
+        if self.sampled.is_some() {
+            // The steps in which a sampled view stops waiting begin at any tick.
+            return ModelTime::ZERO;
+        }
+        let window = settle_window(self.traits.reliable);
+        self.reception.next_due((window, BEST_EFFORT_WINDOW))
+    }
+
     /// Stops waiting for samples in shared memory.
     pub fn settle_sampled(&mut self, context: &mut MeasurementContext<'_>) {
         if let Some(sampled) = &mut self.sampled {

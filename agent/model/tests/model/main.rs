@@ -14,6 +14,7 @@ mod buffers;
 mod chains;
 mod churn;
 mod clocks;
+mod deadlines;
 mod deliveries;
 mod diagnosis;
 mod diagnostics;

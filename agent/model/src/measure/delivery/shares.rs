@@ -30,6 +30,12 @@ impl Delivery {
         self.recent.end_second(self.share());
     }
 
+    /// Returns whether the end of a second leaves the recent losses as they are.
+    #[must_use]
+    pub fn is_quiet(&self) -> bool {
+        self.recent.is_quiet(self.share())
+    }
+
     /// Returns the losses since the end of the last second.
     #[must_use]
     pub fn last_share(&self) -> LossShare {

@@ -10,6 +10,8 @@ use super::EVICTABLE_AFTER;
 use super::Measured;
 use super::ObservationOutcome;
 use super::Profiler;
+use super::UNKNOWN_AFTER;
+use super::UNKNOWN_WRITER_TIMEOUT;
 use crate::facts::journal::Journal;
 use crate::facts::model_time::ModelTime;
 use crate::facts::observation::Observation;
@@ -26,6 +28,18 @@ pub struct UnknownWriters {
     pub metered: Vec<Guid>,
     /// Writers that were dropped.
     pub forgotten: Vec<Guid>,
+}
+
+impl UnknownWriters {
+    /// Notes an unknown writer that is metered from now on, or was silent for too long.
+    pub(super) fn advance(&mut self, (guid, measured): (Guid, &mut Measured), now: ModelTime) {
+        if measured.last_seen + UNKNOWN_WRITER_TIMEOUT <= now {
+            self.forgotten.push(guid);
+        } else if !measured.metered && measured.first_seen + UNKNOWN_AFTER <= now {
+            (measured.metered, measured.opened) = (true, now);
+            self.metered.push(guid);
+        }
+    }
 }
 
 impl Profiler {

@@ -45,6 +45,36 @@ impl Subscribers {
         }
     }
 
+    /// Returns the time from which [`Self::advance`] has an effect without an observation, after a
+    /// call at `now`; [`ModelTime::MAX`] if never. `reliable` is that of the context.
+    #[must_use]
+    pub fn next_due(&self, reliable: bool, now: ModelTime) -> ModelTime {
+        let own = self.deliveries.iter().map(|each| each.next_due(reliable));
+        let marks = self.deliveries.iter().filter_map(|delivery| {
+            let known = self.routes.get(self.routes.find(&delivery.main())?)?;
+            let is_marked = delivery.main().is_sent() && self.totals.seen == [true, true];
+            is_marked.then(|| known.next_mark(delivery.next().previous()))
+        });
+        let times = own.chain(marks).chain([self.next_second(now)]);
+        times.min().unwrap_or(ModelTime::MAX)
+    }
+
+    /// Returns the next whole second whose end has an effect. Observations may have changed
+    /// anything since the last one.
+    fn next_second(&self, now: ModelTime) -> ModelTime {
+        let second = ModelTime::of_second(now.whole_seconds() + 1);
+        let is_open = !now.nanoseconds().is_multiple_of(SECOND);
+        if is_open || !self.deliveries.iter().all(Delivery::is_quiet) {
+            return second;
+        }
+        let unmatched = self
+            .routes
+            .iter()
+            .filter(|known| known.matched != Matched::Yes);
+        let oldest = unmatched.map(|known| known.last_seen).min();
+        oldest.map_or(ModelTime::MAX, |oldest| oldest + ROUTE_TIMEOUT)
+    }
+
     /// Settles all samples at the end of the input.
     pub fn settle(&mut self, context: &mut WriterContext<'_>) {
         self.expect(context, true);

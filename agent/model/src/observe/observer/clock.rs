@@ -36,13 +36,30 @@ impl Observer {
         }
     }
 
-    /// Returns the time of the next decision that may become an event: a whole second, or the end
-    /// of a lease.
+    /// Returns the time of the next decision that may become output: a whole second or the end of a
+    /// lease. A timer of a writer becomes output only if it may end the wait for a requested
+    /// sample.
     #[must_use]
     pub fn next_decision(&self) -> Timestamp {
+        if !self.requested.sample_requests.is_empty() {
+            return self.next_due();
+        }
         let second = ModelTime::of_second(self.clock.whole_seconds() + 1);
         let second = self.graph.wall_clock.wall_time(second);
         self.next_expiry().map_or(second, |end| end.min(second))
+    }
+
+    /// Returns the earliest time at which [`Self::tick`] has an effect without further input.
+    #[must_use]
+    pub fn next_due(&self) -> Timestamp {
+        let second = ModelTime::of_second(self.clock.whole_seconds() + 1);
+        let due = match self.measure.payloads.unsettled().is_empty() {
+            true => self.measure.profiler.next_due(&self.graph).min(second),
+            false => self.clock,
+        };
+        let due = due.round_up(TICK).max(self.clock + TICK);
+        let due = self.graph.wall_clock.wall_time(due);
+        self.next_expiry().map_or(due, |end| end.min(due))
     }
 
     /// Returns the earliest end of a participant's lease, unless further packets renew it. Leases
@@ -308,3 +325,6 @@ impl Observer {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;
