@@ -518,15 +518,13 @@ mod tests {
     fn a_signal_does_not_end_the_wait_for_an_answer() {
         extern "C" fn ignore(_: libc::c_int) {}
         let handler = ignore as extern "C" fn(libc::c_int);
-        // SAFETY: the handler does nothing, and the action is zeroed apart from it.
-        unsafe {
-            let mut action: libc::sigaction = std::mem::zeroed();
-            action.sa_sigaction = handler as libc::sighandler_t;
-            assert_eq!(
-                libc::sigaction(libc::SIGUSR1, &raw const action, std::ptr::null_mut()),
-                0
-            );
-        }
+        // SAFETY: zeros are an action without flags.
+        let mut action: libc::sigaction = unsafe { std::mem::zeroed() };
+        action.sa_sigaction = handler as libc::sighandler_t;
+        let before = std::ptr::null_mut();
+        // SAFETY: the handler does nothing.
+        let set = unsafe { libc::sigaction(libc::SIGUSR1, &raw const action, before) };
+        assert_eq!(set, 0);
         let (mut broker, other) = child();
         // SAFETY: no preconditions.
         let waiting = unsafe { libc::pthread_self() };

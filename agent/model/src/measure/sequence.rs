@@ -424,7 +424,7 @@ impl Sequence {
         let is_open = self.started() && self.settled < self.next;
         let noted = match self.checkpoints.back() {
             Some((_, next)) if *next >= self.next => None,
-            Some((at, _)) => Some(*at + window / STEPS),
+            Some((at, _)) => Some(*at + window / SETTLING_STEPS),
             None => Some(ModelTime::ZERO),
         };
         let times = [withdrawn, settled, noted.filter(|_| is_open)];

@@ -122,7 +122,7 @@ impl Undelivered {
     #[must_use]
     pub fn next_expiry(&self) -> ModelTime {
         let oldest = self.waiting.front();
-        oldest.map_or(ModelTime::MAX, |oldest| oldest.last + LIFETIME)
+        oldest.map_or(ModelTime::MAX, |oldest| oldest.last + DROP_LIFETIME)
     }
 
     /// Removes entries whose arrival did not follow.

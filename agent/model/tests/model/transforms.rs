@@ -394,7 +394,7 @@ fn static_broadcasters_beyond_the_cap_count_as_read() {
 #[test]
 fn a_retransmitted_transform_is_counted_and_neither_the_last_one_nor_a_step_back() {
     let mut robot = Robot::new();
-    robot.go_on(FIRST, 1);
+    robot.broadcast_for(FIRST, 1);
     let lost = Transform {
         parent: "odom",
         child: "base_link",
@@ -420,7 +420,7 @@ fn a_retransmitted_transform_is_counted_and_neither_the_last_one_nor_a_step_back
 #[test]
 fn transforms_of_a_broadcaster_that_restarted_its_numbers_are_read() {
     let mut robot = Robot::new();
-    robot.go_on(FIRST, 10);
+    robot.broadcast_for(FIRST, 10);
     robot.numbers[0] = 0;
     robot.wait(1_000);
     let transform = Transform {

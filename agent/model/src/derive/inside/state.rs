@@ -612,7 +612,7 @@ impl Inside {
             calls: late.calls,
             stage: late.stage,
             cause: late.cause,
-            by: late.longest.by.clone(),
+            by: late.longest.other_thread.clone(),
             longest: late.longest.total,
         }
     }

@@ -51,8 +51,8 @@ impl Subscribers {
     pub fn next_due(&self, reliable: bool, now: ModelTime) -> ModelTime {
         let own = self.deliveries.iter().map(|each| each.next_due(reliable));
         let marks = self.deliveries.iter().filter_map(|delivery| {
-            let known = self.routes.get(self.routes.find(&delivery.main())?)?;
-            let is_marked = delivery.main().is_sent() && self.totals.seen == [true, true];
+            let known = self.routes.get(self.routes.find(&delivery.main_route())?)?;
+            let is_marked = delivery.main_route().is_sent() && self.totals.seen == [true, true];
             is_marked.then(|| known.next_mark(delivery.next().previous()))
         });
         let times = own.chain(marks).chain([self.next_second(now)]);
