@@ -193,8 +193,8 @@ fn not_opened(error: Errno) -> OpenError {
 }
 
 /// Fails unless the file is on a local file system. An overlay counts as local if only root can
-/// have mounted it: `process`, which maps the file, then sees this mount, and is in the broker's
-/// user namespace. A user's overlay in a user namespace may lie on FUSE, and another process can
+/// have mounted it: `process`, which maps the file, then sees this mount. It is also in the
+/// broker's user namespace. A user's overlay in a user namespace may lie on FUSE, and another process can
 /// open its files through `/proc/<pid>/root`.
 fn check_file_system(file: &File, process: Option<u32>) -> Result<(), OpenError> {
     let kind = fstatfs(file)

@@ -481,7 +481,7 @@ mod tests {
             let attempts = |of: &Arc<AtomicU32>| of.load(Ordering::Relaxed);
             let (mut now, broker) = (Instant::now(), &mut Broker::here());
             let mut follow = |probes: &mut Probes, to_calls| {
-                now += RETRY_DELAY;
+                now += 2 * RETRY_DELAY;
                 probes.install(to_calls, now, broker);
                 probes.follow(&processes, to_calls, now, broker);
             };

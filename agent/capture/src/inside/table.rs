@@ -99,7 +99,7 @@ struct Observed {
 type Mark = [u64; 5];
 
 impl Observed {
-    /// Asks the broker for the domain, and returns whether it answered. The environment of a process
+    /// Requests the domain from the broker, and returns whether it answered. The environment of a process
     /// that cannot be read has domain 0.
     fn find_domain(&mut self, process: u32, broker: &mut Broker) -> bool {
         match broker.domain(process) {
@@ -173,8 +173,8 @@ impl ProcessTable {
         self.known.is_empty()
     }
 
-    /// Reads the waiting announcements, but not all that processes make meanwhile. `broker` provides
-    /// facts about the processes.
+    /// Reads the waiting announcements, at most 10,000. `broker` provides facts about the
+    /// processes.
     pub fn drain(&mut self, tables: &mut Tables, clocks: &Clocks, broker: &mut Broker) {
         let items = std::iter::from_fn(|| tables.next_announcement(Item::read));
         self.apply_items(items, clocks, broker);
@@ -255,7 +255,7 @@ impl ProcessTable {
         })
     }
 
-    /// Asks again for the domains of running processes, until the broker does not answer. Processes
+    /// Requests missing domains of running processes, until the broker does not answer. Processes
     /// with the fewest failed requests come first, because a request may take half a second.
     fn find_domains(&mut self, running: &HashMap<u32, Stat>, broker: &mut Broker) {
         let unknown = self.known.iter_mut().filter(|(id, observed)| {

@@ -14,28 +14,29 @@ use super::*;
 
 /// The program with its library on an overlay, in a mount namespace of its own.
 struct Overlay {
-    _program: TracedProgram,
-    directory: TempDir,
+    program: TracedProgram,
+    _directory: TempDir,
     process: Process,
 }
 
 impl Overlay {
-    /// Mounts the overlay, and runs `command` there. `options` are those of `unshare`.
+    /// Mounts the overlay in place of the program's directory, and runs `command` there. `options`
+    /// are those of `unshare`. The program names its library by this path.
     fn new(options: &[&str], command: &str) -> Self {
         let program = TracedProgram::build(248, &[]).unwrap();
         let directory = tempfile::tempdir().unwrap();
         let at = directory.path().display();
         let lower = program.program().parent().unwrap().display().to_string();
         let script = format!(
-            "cd {at} && mkdir on && mount -t tmpfs none on && mkdir on/empty on/all \
-             && mount -t overlay -o xino=off,lowerdir=on/empty:{lower} none on/all \
-             && {command}"
+            "cd {at} && mkdir on && mount -t tmpfs none on && mkdir on/empty \
+             && mount -t overlay -o xino=off,lowerdir=on/empty:{lower} none {lower} \
+             && cd {lower} && {command}"
         );
         let all = [options, &["--mount", "sh", "-c", &script]].concat();
         let process = Process::with(Path::new("unshare"), &all);
         Self {
-            _program: program,
-            directory,
+            program,
+            _directory: directory,
             process,
         }
     }
@@ -43,8 +44,8 @@ impl Overlay {
     /// Returns the library as other processes can open it.
     fn library(&self) -> PathBuf {
         let id = self.process.child.id();
-        let at = self.directory.path().display();
-        format!("/proc/{id}/root{at}/on/all/libtracetools.so").into()
+        let library = self.program.library();
+        format!("/proc/{id}/root{}", library.display()).into()
     }
 }
 
@@ -61,7 +62,7 @@ fn opened(process: u32) -> Result<File, OpenError> {
 
 #[test]
 fn a_library_on_the_overlay_of_a_container_is_opened() {
-    let mut overlay = Overlay::new(&[], "exec on/all/process");
+    let mut overlay = Overlay::new(&[], "exec ./process");
     overlay.process.run("publish 1");
     assert!(opened(overlay.process.child.id()).is_ok());
 }
@@ -93,7 +94,7 @@ fn a_library_on_the_overlay_of_a_user_is_refused_in_a_process_of_the_host() {
 
 #[test]
 fn an_installed_library_has_the_identity_that_processes_show() {
-    let mut overlay = Overlay::new(&[], "exec on/all/process");
+    let mut overlay = Overlay::new(&[], "exec ./process");
     overlay.process.run("publish 1");
     let id = id_as_mapped(&overlay.library()).unwrap();
     assert_eq!(id, mapped(overlay.process.child.id()).id);

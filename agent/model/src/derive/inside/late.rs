@@ -218,8 +218,8 @@ impl Lateness {
         self.alarm.judge(found.map(|(_, calls)| (calls, 0))) || has_changed
     }
 
-    /// Returns the most frequent cause of the window that ends at `at`, or `kept` if its late calls
-    /// suffice, and the late calls of this cause; `None` if they are few.
+    /// Returns a cause and its late calls in the window that ends at `at`; `None` if they are few. It
+    /// is the most frequent cause, or `kept` if its late calls suffice.
     fn most_frequent_cause(
         &self,
         at: ModelTime,
