@@ -59,8 +59,8 @@ impl RequestBegin {
         self.first.is_some_and(|first| first > number)
     }
 
-    /// Records a sample that arrived for the requests `to`, or was reported to them as missing. All
-    /// later samples then concern these requests, too.
+    /// Records a sample that arrived for the requests `to`, or was reported to them as missing. Later
+    /// samples concern these requests, too.
     pub(super) fn concerns(&mut self, to: &[u64], number: SequenceNumber) {
         if self.first.is_none_or(|first| number < first) && to.contains(&self.id) {
             self.first = Some(number);
