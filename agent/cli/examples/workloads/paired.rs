@@ -1,8 +1,8 @@
 //! `make cost`: the additional cost of an observer, with its confidence interval.
 //!
 //! The workload runs on while an observer comes and goes. Each window beside the observer is
-//! compared with the windows directly before and after it, so that a change of the machine's other
-//! work affects both alike. Windows are short and numerous: the interval shows whether a difference
+//! compared with the windows directly before and after it. A change of the machine's other work
+//! affects both alike. Windows are short and numerous: the interval shows whether a difference
 //! is one.
 //!
 //! The CPU time of the workload includes the observer, what the kernel does on its behalf in

@@ -475,11 +475,15 @@ fn the_action_runs_rp_ci_with_its_inputs_and_keeps_the_status() -> Result<()> {
 /// Returns the process id of the agent of `rp ci` on a host.
 fn agent_of(host: &Namespace) -> Result<String> {
     let group = fs::read_to_string(host.cgroup().join("cgroup.procs"))?;
-    let agent = group.lines().find(|id| {
+    // A child that the agent forks has the same command line for a moment, and a later id.
+    let ids = group.lines().filter_map(|id| id.parse::<u32>().ok());
+    let mut ids: Vec<_> = ids.collect();
+    ids.sort_unstable();
+    let agent = ids.into_iter().find(|id| {
         let line = fs::read(format!("/proc/{id}/cmdline")).unwrap_or_default();
         line.windows(9).any(|part| part == b"--private")
     });
-    Ok(agent.context("no agent")?.to_owned())
+    Ok(agent.context("no agent")?.to_string())
 }
 
 #[test]

@@ -24,6 +24,9 @@ const REPORT_INTERVAL: Duration = Duration::from_millis(500);
 /// for up to 4 s.
 const DRAIN_TIMEOUT: Duration = Duration::from_secs(5);
 
+/// Minimum time by which the clock of a replay differs from that of this host.
+const REPLAY_AGE: Duration = Duration::from_secs(60);
+
 /// Command to a recording.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Command {
@@ -95,6 +98,7 @@ pub fn record<E>(
     let mut stopping: Option<(Timestamp, Instant)> = None;
     let mut abort = false;
     let mut reported = Instant::now();
+    let mut last_clock = None;
     report_activity(Activity::Recording(&recorder));
     let (refused, broke) = loop {
         match execute(commands, &mut recorder) {
@@ -102,7 +106,8 @@ pub fn record<E>(
             Ok(CommandOutcome::SnapshotWritten) => report_activity(Activity::Recording(&recorder)),
             Ok(CommandOutcome::Stop) => {
                 if stopping.is_none() {
-                    stopping = Some((now(), Instant::now() + DRAIN_TIMEOUT));
+                    let since = end_of(last_clock);
+                    stopping = Some((since, Instant::now() + DRAIN_TIMEOUT));
                     report_activity(Activity::Completing);
                 }
             }
@@ -137,6 +142,7 @@ pub fn record<E>(
         match (&item, stopping) {
             (Item::End(_), _) => break (None, None),
             (Item::Clock(clock), Some((since, _))) if *clock >= since => break (None, None),
+            (Item::Clock(clock), _) => last_clock = Some(*clock),
             _ => {}
         }
     };
@@ -273,6 +279,16 @@ impl<T: FnMut(Activity<'_>)> Completion<'_, T> {
             self.reported = Instant::now();
             (self.report_activity)(Activity::Compressing { done, of });
         }
+    }
+}
+
+/// Returns the time up to which messages are recorded when the end is requested now. `last_clock` is
+/// the latest clock of the source, which in a replay is that of the capture.
+fn end_of(last_clock: Option<Timestamp>) -> Timestamp {
+    let now = now();
+    match last_clock {
+        Some(clock) if now.distance(clock) > REPLAY_AGE => clock,
+        _ => now,
     }
 }
 

@@ -20,8 +20,7 @@ fn a_recording_of_many_topics_begins_and_ends_without_a_request_for_each_topic()
     eprintln!("{MANY} topics: began after {began:?}, ended after {ended:?}");
     assert_eq!(status.code(), Some(0), "{:#?}", recording.printed);
     assert!(began < Duration::from_secs(3), "began after {began:?}");
-    // The end waits up to two seconds for messages in transit, because the clock of a replay
-    // differs from the current time.
+    // The end waits for the next clock of the replay, which differs from the current time.
     assert!(ended < Duration::from_secs(5), "ended after {ended:?}");
     assert_eq!(messages(&bag).len(), MANY);
 }

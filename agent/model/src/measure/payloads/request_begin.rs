@@ -72,7 +72,7 @@ impl RequestBegin {
     ///
     /// Polling shared memory notices numbers late, perhaps those of samples that were sent before
     /// the request. Numbers that polling missed therefore count from the first sample that arrives or
-    /// is reported. If there is none in time, they count from the start of the request.
+    /// is reported. If no sample does in time, they count from the start of the request.
     pub(super) fn first_missed(
         &self,
         reason: MissedReason,
