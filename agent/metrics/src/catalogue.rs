@@ -256,8 +256,8 @@ pub const TOPIC_BYTES: Metric = Metric::counter(
 pub const TOPIC_LOST: Metric = Metric::counter(
     "ros2_topic_lost_messages_total",
     TOPIC,
-    "Messages that were sent but never seen whole on this host: sequence gaps neither excused nor \
-     repaired. A subscriber may lose more.",
+    "Messages that were sent but never seen whole on this host: sequence gaps that the \
+     writer neither declared irrelevant nor repaired. A subscriber may lose more.",
 );
 pub const TOPIC_SUBSCRIBER_EXPECTED: Metric = Metric::counter(
     "ros2_topic_subscriber_expected_messages_total",
