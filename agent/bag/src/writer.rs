@@ -368,24 +368,18 @@ impl Writer {
     #[must_use]
     pub fn bytes(&self) -> u64 {
         let current = self.current.as_ref().map_or(0, FileWriter::position);
-        current
-            + self
-                .complete_files
-                .iter()
-                .map(|file| file.bytes)
-                .sum::<u64>()
+        current + self.complete_bytes()
     }
 
     /// Returns the same as [`Self::bytes`], plus the bytes that are not written yet.
     #[must_use]
     pub fn expected_bytes(&self) -> u64 {
         let current = self.current.as_ref().map_or(0, FileWriter::expected_bytes);
-        current
-            + self
-                .complete_files
-                .iter()
-                .map(|file| file.bytes)
-                .sum::<u64>()
+        current + self.complete_bytes()
+    }
+
+    fn complete_bytes(&self) -> u64 {
+        self.complete_files.iter().map(|file| file.bytes).sum()
     }
 
     /// Returns the number of files begun so far.

@@ -103,7 +103,7 @@ pub fn record<E>(
     let (refused, broke) = loop {
         match execute(commands, &mut recorder) {
             Ok(CommandOutcome::Nothing) => {}
-            Ok(CommandOutcome::SnapshotWritten) => report_activity(Activity::Recording(&recorder)),
+            Ok(CommandOutcome::Executed) => report_activity(Activity::Recording(&recorder)),
             Ok(CommandOutcome::Stop) => {
                 if stopping.is_none() {
                     let since = end_of(last_clock);
@@ -164,7 +164,7 @@ pub fn record<E>(
 
 enum CommandOutcome {
     Nothing,
-    SnapshotWritten,
+    Executed,
     Stop,
     Abort,
 }
@@ -186,7 +186,7 @@ fn execute(
             Ok(Command::Stop) | Err(TryRecvError::Disconnected) => return Ok(CommandOutcome::Stop),
             Err(TryRecvError::Empty) => return Ok(outcome),
         }
-        outcome = CommandOutcome::SnapshotWritten;
+        outcome = CommandOutcome::Executed;
     }
 }
 
