@@ -365,10 +365,12 @@ impl Run {
         let new_clock = (clock > self.published_until).then_some(clock);
         self.published_until = self.published_until.max(clock);
         self.subscriptions.deliver(output.samples, new_clock);
-        let complete = self.observer.complete_until(now);
-        if complete > self.complete_until || complete + SET_BACK < self.complete_until {
-            self.complete_until = complete;
-            self.subscriptions.complete(complete);
+        if self.subscriptions.need_complete_clock() {
+            let complete = self.observer.complete_until(clock);
+            if complete > self.complete_until || complete + SET_BACK < self.complete_until {
+                self.complete_until = complete;
+                self.subscriptions.complete(complete);
+            }
         }
         has_event
     }

@@ -319,6 +319,13 @@ impl Subscriptions {
         }
     }
 
+    /// For the capture thread: returns whether [`Self::complete`] has an effect.
+    #[must_use]
+    pub fn need_complete_clock(&self) -> bool {
+        let channels = self.channels.load();
+        channels.iter().any(|channel| channel.is_clock_complete())
+    }
+
     /// For the capture thread: queues the clock for subscriptions that need a complete one.
     pub fn complete(&self, clock: Timestamp) {
         for channel in self.channels.load().iter() {

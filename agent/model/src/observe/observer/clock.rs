@@ -77,10 +77,7 @@ impl Observer {
         self.measure
             .profiler
             .settle(self.clock, &mut self.journal, graph);
-        self.report_missing();
-        for writer in self.measure.payloads.unsettled() {
-            self.measure.payloads.dispatch_all(writer, self.clock);
-        }
+        self.dispatch_waiting();
         self.end_second_of_losses();
         self.report_losses();
         self.settle_chains();

@@ -43,14 +43,13 @@ impl Observer {
         })
     }
 
-    /// Returns the latest time before which no sample waits for lower numbers either. A reliable
-    /// writer may take seconds to repeat one.
+    /// Returns the latest time up to `dispatched_until` before which no sample waits for lower numbers
+    /// either. A reliable writer may take seconds to repeat one.
     #[must_use]
-    pub fn complete_until(&self, now: Timestamp) -> Timestamp {
-        let until = self.dispatched_until(now);
+    pub fn complete_until(&self, dispatched_until: Timestamp) -> Timestamp {
         let waiting = self.measure.payloads.waiting_since();
-        waiting.map_or(until, |since| {
-            until.min(self.graph.wall_clock.wall_time(since))
+        waiting.map_or(dispatched_until, |since| {
+            dispatched_until.min(self.graph.wall_clock.wall_time(since))
         })
     }
 
@@ -59,6 +58,11 @@ impl Observer {
     pub(super) fn release_waiting(&mut self) {
         let (profiler, graph) = (&mut self.measure.profiler, &self.graph);
         profiler.settle_sampled(self.clock, &mut self.journal, graph);
+        self.dispatch_waiting();
+    }
+
+    /// Reports what was settled as missing, and dispatches the samples that wait for others.
+    pub(super) fn dispatch_waiting(&mut self) {
         self.report_missing();
         for writer in self.measure.payloads.unsettled() {
             self.measure.payloads.dispatch_all(writer, self.clock);
