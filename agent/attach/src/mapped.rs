@@ -28,6 +28,19 @@ pub struct LibraryId {
     pub inode: u64,
 }
 
+impl LibraryId {
+    /// Parses a line of a map. Returns the address range, as the kernel writes it, and the file;
+    /// `None` if the line is malformed.
+    #[must_use]
+    pub fn of_mapping(line: &str) -> Option<(&str, Self)> {
+        // A line has range, permissions, offset, device and inode; the rest is the path.
+        let mut fields = line.split_ascii_whitespace();
+        let (range, device, inode) = (fields.next()?, fields.nth(2)?, fields.next()?);
+        let (device, inode) = (device.to_owned(), inode.parse().ok()?);
+        Some((range, Self { device, inode }))
+    }
+}
+
 /// A library in a process.
 #[derive(Clone, PartialEq, Eq, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -56,7 +69,6 @@ impl Use {
     pub fn parse(text: &str, library: Library) -> Self {
         let mut found = Self::default();
         for line in text.lines() {
-            // A line has range, permissions, offset, device and inode; the rest is the path.
             let Some(path) = line.find('/').and_then(|at| line.get(at..)) else {
                 continue;
             };
@@ -65,14 +77,7 @@ impl Use {
                 .any(|start| path.starts_with(start));
             let name = path.rsplit('/').next().unwrap_or_default();
             let is_library = library.has_name(name.strip_suffix(DELETED_SUFFIX).unwrap_or(name));
-            let mut fields = line.split_ascii_whitespace();
-            let (range, device, inode) = (fields.next(), fields.nth(2), fields.next());
-            let inode = inode.and_then(|inode| inode.parse().ok());
-            if let (true, Some(range), Some(device), Some(inode)) =
-                (is_library, range, device, inode)
-            {
-                let device = device.to_owned();
-                let id = LibraryId { device, inode };
+            if is_library && let Some((range, id)) = LibraryId::of_mapping(line) {
                 let is_known = found.libraries.iter().any(|known| known.id == id);
                 if !is_known && found.libraries.len() < MAX_LIBRARIES {
                     let (path, range) = (PathBuf::from(path), range.to_owned());

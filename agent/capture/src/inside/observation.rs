@@ -77,15 +77,20 @@ impl Probes {
     /// Attaches the lasting probes to installed libraries. Without `to_calls`, they stay detached if
     /// they are also at calls.
     pub(super) fn install(&mut self, to_calls: bool, now: Instant, broker: &mut Broker) {
-        if to_calls || self.on_demand.is_some() {
+        if self.needs_lasting(to_calls) {
             self.lasting.install(Library::Tracing, now, broker);
         }
+    }
+
+    /// Returns whether the lasting probes are attached, which are also at calls if none is on demand.
+    const fn needs_lasting(&self, to_calls: bool) -> bool {
+        to_calls || self.on_demand.is_some()
     }
 
     /// Attaches the lasting probes to the libraries in use, as [`Self::install`] does; with
     /// `to_calls`, also the on-demand probes.
     fn follow(&mut self, processes: &Processes, to_calls: bool, now: Instant, broker: &mut Broker) {
-        if to_calls || self.on_demand.is_some() {
+        if self.needs_lasting(to_calls) {
             self.lasting.follow(processes, now, broker);
         }
         if let Some(on_demand) = self.on_demand.as_mut().filter(|_| to_calls) {

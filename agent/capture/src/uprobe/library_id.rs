@@ -47,9 +47,7 @@ pub fn id_as_mapped(path: &Path) -> io::Result<LibraryId> {
 fn mapped_at(maps: &str, address: usize) -> Option<LibraryId> {
     let start = format!("{address:08x}-");
     let line = maps.lines().find(|line| line.starts_with(&start))?;
-    let mut fields = line.split_ascii_whitespace().skip(3);
-    let (device, inode) = (fields.next()?.to_owned(), fields.next()?.parse().ok()?);
-    Some(LibraryId { device, inode })
+    LibraryId::of_mapping(line).map(|(_, id)| id)
 }
 
 #[cfg(test)]

@@ -15,7 +15,6 @@ mod text;
 pub mod transforms;
 
 use std::sync::Arc;
-use std::time::Duration;
 
 use foldhash::HashMap;
 use ros2probe_wire::diagnostics::{self as wire, DiagnosticStatuses};
@@ -38,6 +37,7 @@ use crate::facts::tables::RobotWriters;
 use crate::graph::discovery::Discovery;
 use crate::measure::allowance::{Allowance, CommonAllowance, WriterAllowance};
 use crate::measure::assembly::Assembly;
+use crate::measure::sequence::MIN_INCARNATION_GAP;
 use diagnostics::Diagnostics;
 use fields::{FieldMessage, Fields};
 use frames::Frames;
@@ -59,9 +59,6 @@ const BROADCASTER_ALLOWANCE: Allowance = Allowance::new(2 << 20, 512 << 10);
 const COMMON_BROADCASTER_ALLOWANCE: Allowance = Allowance::new(8 << 20, 2 << 20);
 /// A paused writer is captured again once it is allowed this many bytes.
 const RESUME_BYTES: u64 = 256 << 10;
-/// Minimum time by which a message with a lower number is written later, after a restart of its
-/// writer.
-const RESTART: Duration = Duration::from_millis(100);
 
 /// Standard topics and services that the agent reads; each can be switched off.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -650,7 +647,8 @@ impl ReadNumbers {
     /// Returns whether the writer has restarted its numbers: a lower one was written later.
     fn is_restart(&self, number: SequenceNumber, source: Option<Timestamp>) -> bool {
         let times = source.zip(self.source);
-        number < self.newest && times.is_some_and(|(new, newest)| new > newest + RESTART)
+        number < self.newest
+            && times.is_some_and(|(new, newest)| new > newest + MIN_INCARNATION_GAP)
     }
 }
 
@@ -671,7 +669,7 @@ fn steps(number: SequenceNumber, lower: SequenceNumber) -> u32 {
 mod tests {
     use super::*;
 
-    const LATER: Timestamp = Timestamp(RESTART.as_nanos() as u64 + 2);
+    const LATER: Timestamp = Timestamp(MIN_INCARNATION_GAP.as_nanos() as u64 + 2);
 
     #[test]
     fn a_number_is_read_once_and_old_ones_are_copies() {

@@ -41,7 +41,7 @@ pub const MAX_TRUSTED_JUMP: u64 = 64;
 /// DDS) before they answer a HEARTBEAT.
 const MAX_REORDERING: Duration = Duration::from_millis(5);
 /// A lower number with a source time later by this much begins a new incarnation of the writer.
-const MIN_INCARNATION_GAP: Duration = Duration::from_millis(100);
+pub const MIN_INCARNATION_GAP: Duration = Duration::from_millis(100);
 /// This many consecutive samples below the window also begin a new incarnation, whatever their
 /// source times.
 const MAX_STALE: u32 = 1024;
