@@ -15,6 +15,7 @@ mod paired;
 mod programs;
 mod report;
 mod spread;
+mod subject;
 mod tabs;
 mod window;
 
@@ -28,7 +29,8 @@ use clap::{Parser, ValueEnum};
 use crate::footprint::Footprint;
 use crate::paired::Running;
 use crate::report::{Row, Targets};
-use crate::spread::{Spread, Subject};
+use crate::spread::{Spread, Windows};
+use crate::subject::Subject;
 use crate::window::{Observer, Window};
 use ros2probe_testing::harness::peer::{Stack, Stream};
 
@@ -223,20 +225,15 @@ fn measure(workload: &Workload, stack: Stack, program: &Path, options: &Options)
 fn spread(workload: &Workload, stack: Stack, program: &Path, options: &Options) -> Result<Spread> {
     let streams = workload.streams();
     let seconds = Duration::from_secs(options.seconds);
-    let chosen =
-        |observer: &Observer| options.observer.is_empty() || options.observer.contains(observer);
-    let mut subjects = Vec::new();
-    for observer in Observer::ALL.into_iter().filter(chosen) {
-        if let Some(before) = options.before.as_deref().filter(|_| observer.is_agent()) {
-            subjects.push(Subject::new(observer, before, ", before"));
-        }
-        subjects.push(Subject::new(observer, program, ""));
-    }
+    let subjects = Subject::all(&Observer::ALL, &options.observer, options.binaries(program));
+    let mut subjects: Vec<_> = subjects.into_iter().map(Windows::new).collect();
     for _ in 0..options.rounds {
-        for subject in &mut subjects {
-            let observer = subject.observer();
-            let window = Window::measure(stack, &streams, observer, subject.program(), seconds)?;
-            eprintln!("{}: {}", workload.name, subject.add(&window));
+        for windows in &mut subjects {
+            let Subject {
+                observer, program, ..
+            } = windows.subject();
+            let window = Window::measure(stack, &streams, *observer, program, seconds)?;
+            eprintln!("{}: {}", workload.name, windows.add(&window));
         }
         subjects.rotate_left(1);
     }
@@ -269,7 +266,12 @@ fn compare(program: &Path, pairs: u16, options: &Options) -> Result<()> {
         };
         let running = Running::start(stack, vec![stream], shares_memory, program);
         let running = running.with_context(context)?;
-        let subjects = subjects(program, shares_memory, options);
+        // A subscriber to shared memory would have to be on the host.
+        let kinds: &[Observer] = match shares_memory {
+            true => &[Observer::Host],
+            false => &[Observer::Host, Observer::Wire, Observer::Subscriber],
+        };
+        let subjects = Subject::all(kinds, &options.observer, options.binaries(program));
         let rows = running.measure(name, &subjects, (pairs, seconds));
         for row in rows.with_context(context)? {
             println!("{row}");
@@ -278,28 +280,6 @@ fn compare(program: &Path, pairs: u16, options: &Options) -> Result<()> {
     }
     println!("\n{programs}");
     Ok(())
-}
-
-/// Returns the observers of `make cost`. A subscriber to shared memory would have to be on the host.
-fn subjects(program: &Path, shares_memory: bool, options: &Options) -> Vec<paired::Subject> {
-    let kinds: &[Observer] = match shares_memory {
-        true => &[Observer::Host],
-        false => &[Observer::Host, Observer::Wire, Observer::Subscriber],
-    };
-    let chosen =
-        |observer: &&Observer| options.observer.is_empty() || options.observer.contains(observer);
-    let subject = |observer, program: &Path, note| paired::Subject {
-        observer,
-        program: program.to_path_buf(),
-        note,
-    };
-    let mut subjects = Vec::new();
-    for &observer in kinds.iter().filter(chosen) {
-        let before = options.before.as_deref().filter(|_| observer.is_agent());
-        subjects.extend(before.map(|before| subject(observer, before, ", before")));
-        subjects.push(subject(observer, program, ""));
-    }
-    subjects
 }
 
 /// A process that takes a CPU, until this value is dropped.
@@ -328,6 +308,13 @@ fn shipped() -> Result<PathBuf> {
     let target = target.context("this program is in no target directory")?;
     let triple = format!("{}-unknown-linux-musl", std::env::consts::ARCH);
     Ok(target.join(triple).join("release/rp"))
+}
+
+impl Options {
+    /// Returns the agent's binary, and the one of `--before`.
+    fn binaries<'a>(&'a self, program: &'a Path) -> (&'a Path, Option<&'a Path>) {
+        (program, self.before.as_deref())
+    }
 }
 
 impl Workload {

@@ -10,7 +10,7 @@
 
 use std::fmt;
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::time::Duration;
 
 use anyhow::{Context as _, Result, ensure};
@@ -21,7 +21,8 @@ use ros2probe_testing::harness::shared_memory::SharedMemory;
 use tempfile::TempDir;
 
 use crate::programs::{ProgramCost, Programs};
-use crate::window::{Observer, Spent, WARM_UP, configuration};
+use crate::subject::Subject;
+use crate::window::{Observer, Spent, WARM_UP, configuration, subscribers};
 
 pub(crate) const HEAD: &str = "\
 | workload | observer | pairs | its CPU s | workload alone, CPU s | beside it, % more |
@@ -35,14 +36,6 @@ const LONGER: u32 = 5;
 const STATE: &str = "state";
 /// Megabytes of `/dev/shm`.
 const SHARED_MEGABYTES: u32 = 256;
-
-/// An observer that is compared with none.
-#[derive(Clone)]
-pub(crate) struct Subject {
-    pub(crate) observer: Observer,
-    pub(crate) program: PathBuf,
-    pub(crate) note: &'static str,
-}
 
 /// The publisher and the subscriber, which run until this value is dropped.
 pub(crate) struct Running {
@@ -180,7 +173,8 @@ impl Running {
             return self.spent(&[], length);
         };
         if !subject.observer.is_agent() {
-            let observers = self.subscribers()?;
+            let host = &self.link.monitor;
+            let observers = subscribers(host, Stack::Cyclone, &self.streams, "observer")?;
             std::thread::sleep(SETTLING);
             let watching: Vec<_> = observers.iter().map(|peer| peer.process.pid()).collect();
             return self.spent(&watching, length);
@@ -228,20 +222,6 @@ impl Running {
         fs::write(&file, text).context("cannot write a configuration")?;
         Agent::start(&self.link.robot, program, &file)
     }
-
-    /// Starts another subscriber to everything, Cyclone DDS in C++, on the other host.
-    fn subscribers(&self) -> Result<Vec<Peer>> {
-        let each = self.streams.iter().enumerate().map(|(number, stream)| {
-            let stream = Stream {
-                logged: false,
-                ..stream.clone()
-            };
-            let node = format!("/observer{number}");
-            let host = &self.link.monitor;
-            Peer::start(host, Stack::Cyclone, Role::Subscriber, &stream, &[&node])
-        });
-        each.collect()
-    }
 }
 
 impl Row {
@@ -265,12 +245,6 @@ impl Row {
             format!("- {}, {name}: {cost}\n", self.workload)
         });
         lines.collect()
-    }
-}
-
-impl Subject {
-    fn name(&self) -> String {
-        format!("{:?}{}", self.observer, self.note).to_lowercase()
     }
 }
 

@@ -1,8 +1,8 @@
 //! Minimum, median and maximum of alternating windows, and the additional cost of each observer.
 
 use std::fmt;
-use std::path::{Path, PathBuf};
 
+use crate::subject::Subject;
 use crate::window::{Observer, Window};
 
 pub(crate) const HEAD: &str = "\
@@ -10,10 +10,8 @@ pub(crate) const HEAD: &str = "\
 | --- | --- | ---: | ---: | ---: | ---: | ---: |";
 
 /// One observer, and the cost of its windows.
-pub(crate) struct Subject {
-    observer: Observer,
-    program: PathBuf,
-    note: &'static str,
+pub(crate) struct Windows {
+    subject: Subject,
     cpu: Vec<f64>,
     workload: Vec<f64>,
     counted: f64,
@@ -23,15 +21,13 @@ pub(crate) struct Subject {
 /// The windows of one workload.
 pub(crate) struct Spread {
     workload: String,
-    subjects: Vec<Subject>,
+    observers: Vec<Windows>,
 }
 
-impl Subject {
-    pub(crate) fn new(observer: Observer, program: &Path, note: &'static str) -> Subject {
-        Subject {
-            observer,
-            program: program.to_path_buf(),
-            note,
+impl Windows {
+    pub(crate) const fn new(subject: Subject) -> Windows {
+        Windows {
+            subject,
             cpu: Vec::new(),
             workload: Vec::new(),
             counted: 0.0,
@@ -39,12 +35,8 @@ impl Subject {
         }
     }
 
-    pub(crate) fn observer(&self) -> Observer {
-        self.observer
-    }
-
-    pub(crate) fn program(&self) -> &Path {
-        &self.program
+    pub(crate) const fn subject(&self) -> &Subject {
+        &self.subject
     }
 
     /// Adds a window, and returns its figures as text.
@@ -55,48 +47,48 @@ impl Subject {
             self.counted += totals.counted;
             self.sent += window.sent;
         }
-        let name = self.name();
+        let name = self.subject.name();
         format!(
             "{name} {:.4} s, workload {:.3} s",
             window.cpu, window.workload
         )
     }
-
-    fn name(&self) -> String {
-        format!("{:?}{}", self.observer, self.note).to_lowercase()
-    }
 }
 
 impl Spread {
-    pub(crate) fn new(workload: String, mut subjects: Vec<Subject>) -> Spread {
-        subjects.sort_by(|one, other| {
+    pub(crate) fn new(workload: String, mut observers: Vec<Windows>) -> Spread {
+        observers.sort_by(|one, other| {
+            let (one, other) = (&one.subject, &other.subject);
             let order = one.observer.cmp(&other.observer);
             order.then_with(|| other.note.cmp(one.note))
         });
-        Spread { workload, subjects }
+        Spread {
+            workload,
+            observers,
+        }
     }
 }
 
 impl fmt::Display for Spread {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let mut subjects = self.subjects.iter();
-        let alone = subjects.find(|subject| subject.observer == Observer::None);
-        let alone = alone.map(|subject| median(&subject.workload));
-        for subject in &self.subjects {
+        let mut observers = self.observers.iter();
+        let alone = observers.find(|windows| windows.subject.observer == Observer::None);
+        let alone = alone.map(|windows| median(&windows.workload));
+        for windows in &self.observers {
             let ratio = alone.map_or_else(
                 || "-".to_owned(),
-                |alone| format!("{:.3}", median(&subject.workload) / alone),
+                |alone| format!("{:.3}", median(&windows.workload) / alone),
             );
             writeln!(
                 formatter,
                 "| {} | {} | {} | {} | {} | {ratio} | {} / {} |",
                 self.workload,
-                subject.name(),
-                subject.cpu.len(),
-                spread(&subject.cpu, 4),
-                spread(&subject.workload, 2),
-                subject.counted,
-                subject.sent,
+                windows.subject.name(),
+                windows.cpu.len(),
+                spread(&windows.cpu, 4),
+                spread(&windows.workload, 2),
+                windows.counted,
+                windows.sent,
             )?;
         }
         Ok(())

@@ -99,23 +99,12 @@ impl Window {
             }
             None => None,
         };
-        let subscribers = |stack, node: &str| -> Result<Vec<Peer>> {
-            let each = streams.iter().enumerate().map(|(number, stream)| {
-                let unlogged = Stream {
-                    logged: false,
-                    ..stream.clone()
-                };
-                let node = format!("/{node}{number}");
-                Peer::start(&link.monitor, stack, Role::Subscriber, &unlogged, &[&node])
-            });
-            each.collect()
-        };
         let observers = if observer == Observer::Subscriber {
-            subscribers(Stack::Cyclone, "observer")?
+            subscribers(&link.monitor, Stack::Cyclone, streams, "observer")?
         } else {
             Vec::new()
         };
-        let mut listeners = subscribers(stack, "listener")?;
+        let mut listeners = subscribers(&link.monitor, stack, streams, "listener")?;
         let publishers = streams.iter().enumerate().map(|(number, stream)| {
             let node = format!("/sensor{number}");
             Peer::start(&link.robot, stack, Role::Publisher, stream, &[&node])
@@ -220,6 +209,24 @@ impl Spent {
             memory,
         })
     }
+}
+
+/// Starts a subscriber to each stream, in nodes that are called `node` and a number.
+pub(crate) fn subscribers(
+    host: &Namespace,
+    stack: Stack,
+    streams: &[Stream],
+    node: &str,
+) -> Result<Vec<Peer>> {
+    let each = streams.iter().enumerate().map(|(number, stream)| {
+        let unlogged = Stream {
+            logged: false,
+            ..stream.clone()
+        };
+        let node = format!("/{node}{number}");
+        Peer::start(host, stack, Role::Subscriber, &unlogged, &[&node])
+    });
+    each.collect()
 }
 
 /// Returns the bytes that a host has sent on its link.
