@@ -148,37 +148,62 @@ const SPEEDS = [0.1, 0.5, 1, 2, 5, 10, 60, 0];
 /** @param {number} speed */
 const speedInWords = (speed) => (speed === 0 ? 'without waiting' : `${speed} times`);
 
+/** The latest time that a replay has reached, by the time of its begin. @type {Map<number, number>} */
+const reached = new Map();
+
+/**
+ * Returns the time of the last event at least a second before another time; null if there is none.
+ * @param {import('./state.js').Event[]} events
+ * @param {number} time
+ */
+export function eventBefore(events, time) {
+  const times = events.filter(({ name }) => !/^ros2\.(participant|endpoint)\./.test(name))
+    .map((event) => Date.parse(event.time) / 1000).filter((each) => each <= time - 1);
+  return times.length ? Math.max(...times) : null;
+}
+
 /** The time of a replay, to which the figures of every view refer, and its pace. */
 function Replay() {
   const [problem, take] = useState('');
-  const begin = state.open?.replay?.begin;
+  const { begin, incident } = state.open?.replay ?? {};
   if (begin == null || !state.replay) return null;
   const { part, finished, paused, speed } = state.replay;
+  const end = Math.max(reached.get(begin) ?? begin, state.time);
+  reached.set(begin, end);
   const elapsed = Math.max(0, state.time - begin);
-  const done = finished ? 1 : part;
+  const before = eventBefore(state.events, state.time);
   /** @param {Record<string, any>} change */
   const go = async (change) => {
     try {
       const now = await post('replay', change);
-      state.replay = { part, finished, paused: now.is_paused, speed: now.speed };
+      state.replay = { part, finished: now.is_finished, paused: now.is_paused, speed: now.speed };
       take('');
     } catch (error) {
       take(String(error instanceof Error ? error.message : error));
     }
   };
+  /** @param {number} time */
+  const goTo = (time) => go({ to_timestamp_seconds: Math.max(begin, time) });
   const speeds = SPEEDS.includes(speed) ? SPEEDS : [speed, ...SPEEDS];
   return html`<section class="timebar" aria-label="Time of the replay">
     ${!finished && html`<button type="button" onClick=${() => go({ is_paused: !paused })}>${
       paused ? 'Play' : 'Pause'}</button>`}
-    <label>Replay
-      <progress max="1" value=${done ?? undefined}></progress></label>
+    <button type="button" disabled=${state.time <= begin} onClick=${() => goTo(begin)}>Begin</button>
+    <label>Replay <input type="range" min="0" max=${Math.max(1, Math.ceil(end - begin))} step="1"
+      value=${Math.round(elapsed)}
+      aria-valuetext=${`${duration(elapsed)} after the begin`}
+      onChange=${(/** @type {any} */ event) => goTo(begin + Number(event.target.value))} /></label>
     <span>${date(state.time)}, ${duration(elapsed)} after the begin${
-      finished ? ', finished' : done == null ? '' : `, ${percent(done)} read`}</span>
-    ${!finished && html`<label>Speed <select value=${speed}
+      finished ? ', finished' : part == null ? '' : `, ${percent(part)} read`}</span>
+    ${incident && html`<button type="button" onClick=${() => goTo(Date.parse(incident.time) / 1000)}>
+      Incident</button> <span>${incident.trigger}, ${date(Date.parse(incident.time) / 1000)}</span>`}
+    <button type="button" disabled=${before == null} onClick=${() => goTo(before ?? begin)}>Previous event</button>
+    <button type="button" disabled=${state.time <= begin} onClick=${() => goTo(state.time - 60)}>−1 min</button>
+    ${!finished && html`<button type="button" onClick=${() => go({ to_next_event: true })}>Next event</button>
+    <button type="button" onClick=${() => goTo(state.time + 60)}>+1 min</button>
+    <label>Speed <select value=${speed}
       onChange=${(/** @type {any} */ event) => go({ speed: Number(event.target.value) })}>
-      ${speeds.map((each) => html`<option value=${each}>${speedInWords(each)}</option>`)}</select></label>
-    <button type="button" onClick=${() => go({ to_next_event: true })}>Next event</button>
-    <button type="button" onClick=${() => go({ to_timestamp_seconds: state.time + 60 })}>+1 min</button>`}
+      ${speeds.map((each) => html`<option value=${each}>${speedInWords(each)}</option>`)}</select></label>`}
     ${problem && html`<span class="problem" role="alert">${problem}</span>`}</section>`;
 }
 

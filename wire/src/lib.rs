@@ -28,6 +28,8 @@ pub mod diagnostics;
 pub mod discovery;
 mod domain;
 #[cfg(feature = "alloc")]
+pub mod encode;
+#[cfg(feature = "alloc")]
 pub mod entities;
 mod expansion;
 pub mod filter;

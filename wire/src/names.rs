@@ -259,6 +259,19 @@ impl RosName {
 }
 
 impl DdsType {
+    /// Returns the DDS type of a ROS message: `std_msgs::msg::dds_::String_` for
+    /// `std_msgs/msg/String`.
+    #[must_use]
+    pub fn of_message(message: &RosType) -> Self {
+        let text = message.as_str();
+        Self(match text.rsplit_once('/') {
+            Some((package, name)) => {
+                format!("{}::dds_::{name}_", package.replace('/', "::")).into()
+            }
+            None => text.into(),
+        })
+    }
+
     /// Reads `PID_TYPE_NAME`.
     pub(crate) fn read(value: &mut Cursor<'_>) -> Result<Self, WireError> {
         let offset = value.offset();
@@ -440,6 +453,12 @@ mod tests {
     }
 
     proptest! {
+        #[test]
+        fn mangled_types_survive_a_round_trip(name in "[a-z][a-z0-9_]{0,8}/(msg|srv|action)/[A-Z][a-zA-Z0-9]{0,8}") {
+            let name = RosType::parse(&name).unwrap();
+            prop_assert_eq!(DdsType::of_message(&name).message(), name);
+        }
+
         #[test]
         fn mangled_names_survive_a_round_trip(name in "(/[a-z][a-zA-Z0-9_]{0,8}){1,4}") {
             let name = ros(&name);

@@ -7,6 +7,7 @@ use std::borrow::Cow;
 use serde::{Deserialize, Serialize};
 
 use crate::events::Event;
+use crate::recordings::BagTrigger;
 
 /// A line of the stream: an object with one member.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -66,6 +67,8 @@ pub struct Open {
 pub struct Replay {
     /// Unix time of the first packet; null before it has been read.
     pub begin: Option<f64>,
+    /// What triggered the bag in replay; null unless a snapshot wrote it.
+    pub incident: Option<BagTrigger>,
 }
 
 /// Participants, nodes, topics and endpoints. Each has a number that is unique within the stream

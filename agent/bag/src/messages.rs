@@ -3,11 +3,13 @@
 //! A bag that is damaged or was never completed is read as far as possible: [`Read::faults`] lists
 //! the missing parts. Nothing is written.
 
+use std::collections::BTreeMap;
 use std::error::Error as _;
 use std::ffi::OsStr;
 use std::fmt;
 use std::fs;
 use std::io::{self, Read as _};
+use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 use ros2probe_wire::Expansion;
@@ -16,7 +18,7 @@ use super::info::{SQLITE_MAGIC, read_text};
 use super::mcap;
 use super::metadata::{self, Metadata, MetadataError};
 use super::open_file;
-use super::read::{self, ReadError};
+use super::read::{self, Contents, ReadError};
 use super::sqlite3;
 
 /// One message.
@@ -33,7 +35,7 @@ pub struct Message<'a> {
     /// Time of sending; `None` if the storage has none.
     pub publish_time: Option<u64>,
     /// Start of the payload with its encapsulation header: at least 64 bytes, or all of a shorter
-    /// payload.
+    /// payload. [`read_whole`] has all of it.
     pub begin: &'a [u8],
 }
 
@@ -105,6 +107,85 @@ pub fn is_bag(path: &Path) -> bool {
     path.is_dir() || begin_of(path).is_ok_and(|begin| storage(path, &begin).is_some())
 }
 
+/// A topic of a bag, as far as the bag describes it apart from its messages.
+#[derive(Clone, PartialEq, Eq, Debug, Default)]
+pub struct Topic {
+    /// Name of the topic.
+    pub name: String,
+    /// Its ROS type.
+    pub type_name: String,
+    /// Definition of the type as `.msg` text; empty if it is not known.
+    pub definition: String,
+    /// QoS of its publishers ([`super::qos`]).
+    pub offered_qos_profiles: String,
+    /// RIHS01 hash of the type; empty if it is not known.
+    pub type_description_hash: String,
+}
+
+/// Returns the topics of a bag that metadata.yaml and the summaries of its files describe, by name.
+/// A bag that was never completed describes none.
+#[must_use]
+pub fn topics(path: &Path) -> Vec<Topic> {
+    let mut topics = BTreeMap::new();
+    let metadata = read_text(&path.join(metadata::FILE_NAME)).ok();
+    let metadata = metadata.and_then(|text| Metadata::read(&text).ok());
+    for topic in metadata.into_iter().flat_map(|metadata| metadata.topics) {
+        let described = Topic {
+            name: topic.name.clone(),
+            type_name: topic.type_name,
+            definition: String::new(),
+            offered_qos_profiles: topic.offered_qos_profiles,
+            type_description_hash: topic.type_description_hash,
+        };
+        topics.insert(topic.name, described);
+    }
+    let files = match path.is_dir() {
+        true => files_of(path).map_or_else(|_| Vec::new(), |(files, _)| files),
+        false => vec![path.to_owned()],
+    };
+    for file in files {
+        let Ok(Some(contents)) = Contents::of_summary(&file) else {
+            continue;
+        };
+        for channel in contents.channels.values() {
+            let schema = contents.schemas.get(&channel.schema_id);
+            let entry = |key: &str| channel.metadata.get(key).cloned().unwrap_or_default();
+            let described = topics
+                .entry(channel.topic.clone())
+                .or_insert_with(|| Topic {
+                    name: channel.topic.clone(),
+                    type_name: schema.map(|schema| schema.name.clone()).unwrap_or_default(),
+                    definition: String::new(),
+                    offered_qos_profiles: entry("offered_qos_profiles"),
+                    type_description_hash: entry("topic_type_hash"),
+                });
+            if described.definition.is_empty() {
+                let definition = schema.and_then(definition_of);
+                described.definition = definition.unwrap_or_default().to_owned();
+            }
+        }
+    }
+    topics.into_values().collect()
+}
+
+/// Returns the definition of a type as `.msg` text.
+fn definition_of(schema: &mcap::Schema) -> Option<&str> {
+    let definition = Some(schema).filter(|schema| schema.encoding == "ros2msg");
+    definition.and_then(|schema| std::str::from_utf8(&schema.data).ok())
+}
+
+/// Called for each message, with the number of messages in the bag, if metadata.yaml has it.
+type Visitor<'a> = dyn FnMut(&Message<'_>, Option<u64>) -> ControlFlow<()> + 'a;
+
+/// How much of each payload is read.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+enum Extent {
+    /// Its start.
+    Begin,
+    /// All of it.
+    Whole,
+}
+
 /// Reads the messages of a bag, file by file, in the order in which a file stores them. `each` also
 /// receives the number of messages in the bag, if metadata.yaml has it.
 ///
@@ -115,6 +196,30 @@ pub fn read(
     expansion: Expansion,
     each: &mut dyn FnMut(&Message<'_>, Option<u64>),
 ) -> Result<Read, MessagesError> {
+    read_until(path, expansion, Extent::Begin, &mut |message, total| {
+        each(message, total);
+        ControlFlow::Continue(())
+    })
+}
+
+/// Does the same as [`read`], with whole payloads, until `each` breaks.
+///
+/// # Errors
+/// Fails if nothing can be read.
+pub fn read_whole(
+    path: &Path,
+    expansion: Expansion,
+    each: &mut Visitor<'_>,
+) -> Result<Read, MessagesError> {
+    read_until(path, expansion, Extent::Whole, each)
+}
+
+fn read_until(
+    path: &Path,
+    expansion: Expansion,
+    extent: Extent,
+    each: &mut Visitor<'_>,
+) -> Result<Read, MessagesError> {
     let (files, total) = match path.is_dir() {
         true => files_of(path)?,
         false => (vec![path.to_owned()], None),
@@ -122,15 +227,23 @@ pub fn read(
     let mut result = Read::default();
     let mut failed = None;
     let mut is_any_read = false;
+    let mut is_stopped = false;
     for file in files {
+        if is_stopped {
+            break;
+        }
         let before = result.messages;
-        let read = read_file(&file, expansion, &mut |message| {
+        let read = read_file(&file, expansion, extent, &mut |message| {
             result.messages += 1;
-            each(message, total);
+            let flow = each(message, total);
+            is_stopped = flow.is_break();
+            flow
         });
         is_any_read |= read.is_ok() || result.messages > before;
         match read {
-            Ok(faults) => result.faults.extend(faults),
+            // The rest of a file was not read if the visitor ended the reading.
+            Ok(faults) if !is_stopped => result.faults.extend(faults),
+            Ok(_) => {}
             Err(error) => failed = Some((file, error)),
         }
         // If messages of other files were read, the error concerns one file and not the whole bag.
@@ -250,7 +363,8 @@ fn files_of(directory: &Path) -> Result<(Vec<PathBuf>, Option<u64>), MessagesErr
 fn read_file(
     path: &Path,
     expansion: Expansion,
-    each: &mut dyn FnMut(&Message<'_>),
+    extent: Extent,
+    each: &mut dyn FnMut(&Message<'_>) -> ControlFlow<()>,
 ) -> Result<Vec<Fault>, MessagesError> {
     let begin = begin_of(path).map_err(|source| MessagesError::Io {
         path: path.to_owned(),
@@ -261,7 +375,7 @@ fn read_file(
             ReadError::Io { path, source } => MessagesError::Io { path, source },
             ReadError::NotMcap(path) => MessagesError::Unknown(path),
         }),
-        Some(Storage::Sqlite3) => read_sqlite3(path, each),
+        Some(Storage::Sqlite3) => read_sqlite3(path, extent, each),
         None => Err(MessagesError::Unknown(path.to_owned())),
     }
 }
@@ -269,15 +383,14 @@ fn read_file(
 fn read_mcap(
     path: &Path,
     expansion: Expansion,
-    each: &mut dyn FnMut(&Message<'_>),
+    each: &mut dyn FnMut(&Message<'_>) -> ControlFlow<()>,
 ) -> Result<Vec<Fault>, ReadError> {
     let scan = read::scan_with_cut(path, expansion, &mut |message, contents| {
         let Some(channel) = contents.channels.get(&message.channel_id) else {
-            return;
+            return ControlFlow::Continue(());
         };
         let schema = contents.schemas.get(&channel.schema_id);
-        let definition = schema.filter(|schema| schema.encoding == "ros2msg");
-        let text = definition.and_then(|schema| std::str::from_utf8(&schema.data).ok());
+        let text = schema.and_then(definition_of);
         each(&Message {
             topic: &channel.topic,
             type_name: schema.map_or("", |schema| &schema.name),
@@ -285,7 +398,7 @@ fn read_mcap(
             log_time: message.log_time,
             publish_time: Some(message.publish_time),
             begin: message.data,
-        });
+        })
     })?;
     let mut faults = Vec::new();
     if scan.unreadable_chunks > 0 {
@@ -302,9 +415,14 @@ fn read_mcap(
 
 fn read_sqlite3(
     path: &Path,
-    each: &mut dyn FnMut(&Message<'_>),
+    extent: Extent,
+    each: &mut dyn FnMut(&Message<'_>) -> ControlFlow<()>,
 ) -> Result<Vec<Fault>, MessagesError> {
-    let damaged = sqlite3::read(path, each).map_err(|source| MessagesError::Io {
+    let longest = match extent {
+        Extent::Begin => sqlite3::PREFIX,
+        Extent::Whole => usize::try_from(read::MAX_RECORD).unwrap_or(usize::MAX),
+    };
+    let damaged = sqlite3::read(path, longest, each).map_err(|source| MessagesError::Io {
         path: path.to_owned(),
         source,
     })?;

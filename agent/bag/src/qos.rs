@@ -3,13 +3,22 @@
 //! Two spellings exist. Humble writes and reads the numbers of `rmw_qos_profile_t`; Jazzy and later
 //! write names and read both, depending on whether `history` is a number. For a topic without
 //! publishers, Jazzy writes `[]`. With numbers the text is empty, which every distribution accepts
-//! (Jazzy's reader fails on Humble's own `~`). This module does not interpret profiles as a player
-//! would.
+//! (Jazzy's reader fails on Humble's own `~`). A text is read only to show the QoS of a topic: this
+//! module does not adapt them to subscriptions, as a player would.
 
 use std::fmt::Write as _;
+use std::time::Duration;
 
 use ros2probe_wire::RtpsDuration;
-use ros2probe_wire::qos::{Durability, HistoryKind, Liveliness, Qos, Reliability};
+use ros2probe_wire::discovery::Role;
+use ros2probe_wire::qos::{Durability, History, HistoryKind, Liveliness, Qos, Reliability};
+use ros2probe_wire::rtps::VendorId;
+use serde::Deserialize;
+
+/// Maximum length of a text that is read, in bytes: about a hundred publishers.
+const MAX_TEXT: usize = 32 << 10;
+/// Seconds from which on a duration is infinite. Humble's is 2^63 ns, or 2^31 s.
+const INFINITE_SECONDS: u64 = (1 << 31) - 1;
 
 /// Spelling of policies.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
@@ -37,6 +46,103 @@ pub fn profiles(publishers: &[Qos], spelling: Spelling) -> String {
         profile(&mut text, publisher, spelling);
     }
     text
+}
+
+/// Returns the QoS of the first publisher in a text, in either spelling. Policies that it lacks, or
+/// whose value is unknown, have their defaults. `None` for a text without publishers.
+#[must_use]
+pub fn first(text: &str) -> Option<Qos> {
+    if text.len() > MAX_TEXT {
+        return None;
+    }
+    let profiles: Vec<Profile> = serde_yaml::from_str(text).ok()?;
+    let profile = profiles.into_iter().next()?;
+    let defaults = Qos::defaults(Role::Writer, VendorId([0; 2]));
+    let kinds = [HistoryKind::KEEP_LAST, HistoryKind::KEEP_ALL];
+    let history = profile.history.one_of(kinds, history_kind);
+    let kinds = [Reliability::RELIABLE, Reliability::BEST_EFFORT];
+    let reliability = profile.reliability.one_of(kinds, reliability);
+    let kinds = [Durability::TRANSIENT_LOCAL, Durability::VOLATILE];
+    let durability = profile.durability.one_of(kinds, durability);
+    let kinds = [Liveliness::AUTOMATIC, Liveliness::MANUAL_BY_TOPIC];
+    let liveliness = profile.liveliness.one_of(kinds, liveliness);
+    Some(Qos {
+        reliability: reliability.unwrap_or(defaults.reliability),
+        durability: durability.unwrap_or(defaults.durability),
+        history: history.map(|kind| History {
+            kind,
+            depth: i32::try_from(profile.depth).unwrap_or(i32::MAX),
+        }),
+        deadline: profile.deadline.duration(),
+        lifespan: profile.lifespan.duration(),
+        liveliness: liveliness.unwrap_or(defaults.liveliness),
+        liveliness_lease: profile.liveliness_lease_duration.duration(),
+        ..defaults
+    })
+}
+
+/// A publisher in a text.
+#[derive(Deserialize)]
+struct Profile {
+    #[serde(default)]
+    history: Policy,
+    #[serde(default)]
+    depth: u64,
+    #[serde(default)]
+    reliability: Policy,
+    #[serde(default)]
+    durability: Policy,
+    #[serde(default)]
+    deadline: Span,
+    #[serde(default)]
+    lifespan: Span,
+    #[serde(default)]
+    liveliness: Policy,
+    #[serde(default)]
+    liveliness_lease_duration: Span,
+}
+
+/// A policy, in either spelling.
+#[derive(Default, Deserialize)]
+#[serde(untagged)]
+enum Policy {
+    Number(u8),
+    Name(String),
+    #[default]
+    Unknown,
+}
+
+/// A duration; zero means the default, which is infinite for all policies here.
+#[derive(Default, Deserialize)]
+struct Span {
+    #[serde(default)]
+    sec: u64,
+    #[serde(default)]
+    nsec: u64,
+}
+
+impl Policy {
+    /// Returns the one of these values that has this spelling.
+    fn one_of<T: Copy>(&self, values: [T; 2], spelled: fn(T) -> (u8, &'static str)) -> Option<T> {
+        values.into_iter().find(|value| {
+            let (number, name) = spelled(*value);
+            match self {
+                Self::Number(found) => *found == number,
+                Self::Name(found) => found == name,
+                Self::Unknown => false,
+            }
+        })
+    }
+}
+
+impl Span {
+    fn duration(&self) -> RtpsDuration {
+        if self.sec >= INFINITE_SECONDS || (self.sec, self.nsec) == (0, 0) {
+            return RtpsDuration::Infinite;
+        }
+        let rest = Duration::from_nanos(self.nsec);
+        RtpsDuration::Finite(Duration::from_secs(self.sec).saturating_add(rest))
+    }
 }
 
 fn profile(text: &mut String, qos: &Qos, spelling: Spelling) {
@@ -107,11 +213,6 @@ fn liveliness(kind: Liveliness) -> (u8, &'static str) {
 
 #[cfg(test)]
 mod tests {
-    use std::time::Duration;
-
-    use ros2probe_wire::qos::{History, Role};
-    use ros2probe_wire::rtps::VendorId;
-
     use super::*;
 
     fn publisher() -> Qos {
@@ -136,6 +237,34 @@ mod tests {
         assert_eq!(profiles(&[publisher()], Spelling::Numbers), text);
         let twice = profiles(&[publisher(), publisher()], Spelling::Numbers);
         assert_eq!(twice, format!("{text}\n{text}"));
+    }
+
+    #[test]
+    fn written_profiles_are_read_again_in_both_spellings() {
+        for spelling in [Spelling::Numbers, Spelling::Names] {
+            let text = profiles(&[publisher()], spelling);
+            let read = first(&text).unwrap();
+            assert_eq!(
+                read,
+                Qos {
+                    history: publisher().history,
+                    reliability: Reliability::BEST_EFFORT,
+                    lifespan: publisher().lifespan,
+                    ..Qos::defaults(Role::Writer, VendorId([0; 2]))
+                }
+            );
+        }
+    }
+
+    #[test]
+    fn a_text_without_publishers_has_no_qos() {
+        for text in ["", "[]", "~", "- 1", "{", &" ".repeat(MAX_TEXT + 1)] {
+            assert_eq!(first(text), None, "{text}");
+        }
+        // A bag of Foxy has fewer policies.
+        let read =
+            first("- history: 3\n  reliability: 9\n  deadline: {sec: 0, nsec: 0}\n").unwrap();
+        assert_eq!(read, Qos::defaults(Role::Writer, VendorId([0; 2])));
     }
 
     #[test]

@@ -7,6 +7,7 @@
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{self, BufReader, Read, Seek as _, SeekFrom};
+use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 use ros2probe_wire::{ExpandsTooFar, Expansion};
@@ -18,7 +19,7 @@ use super::mcap::{
 use super::{Compression, open_file};
 
 /// Maximum length of a record, in bytes; a larger length is damage.
-const MAX_RECORD: u64 = 1 << 30;
+pub(super) const MAX_RECORD: u64 = 1 << 30;
 /// Maximum factor by which a file may expand beyond [`Expansion::FREE_BYTES`]. Recordings stay far
 /// below: a few megabytes of the same byte are rare.
 const EXPANSION_FACTOR: u64 = 1024;
@@ -51,6 +52,8 @@ pub struct Scan {
     pub sizes: BTreeMap<u16, u64>,
     /// Whether the data section is complete.
     pub is_ended: bool,
+    /// Whether the visitor ended the reading.
+    pub(super) is_stopped: bool,
     /// End of the data section's last complete record.
     pub end: u64,
     /// Chunks of the data section, as in an index.
@@ -103,7 +106,7 @@ impl Contents {
         {
             return Ok(contents);
         }
-        Ok(scan_with_cut(path, expansion, &mut |_, _| {})?.contents)
+        Ok(scan_with_cut(path, expansion, &mut |_, _| ControlFlow::Continue(()))?.contents)
     }
 
     /// Returns the number of messages of all channels, saturating: a summary may contain any
@@ -200,9 +203,23 @@ fn read_at(file: &mut File, offset: u64, length: u64) -> io::Result<Vec<u8>> {
 
 /// Called for every message, with the content read before it.
 pub type Visitor<'a> = dyn FnMut(&Message<'_>, &Contents) + 'a;
+/// A [`Visitor`] that may end the reading.
+pub(super) type StoppingVisitor<'a> = dyn FnMut(&Message<'_>, &Contents) -> ControlFlow<()> + 'a;
 
 /// Reads a file record by record, decompressing `.zstd` and `.lz4`.
 pub fn scan(path: &Path, expansion: Expansion, each: &mut Visitor<'_>) -> Result<Scan, ReadError> {
+    scan_until(path, expansion, &mut |message, contents| {
+        each(message, contents);
+        ControlFlow::Continue(())
+    })
+}
+
+/// Does the same as [`scan`], until the visitor breaks.
+fn scan_until(
+    path: &Path,
+    expansion: Expansion,
+    each: &mut StoppingVisitor<'_>,
+) -> Result<Scan, ReadError> {
     let wrong = |source| ReadError::Io {
         path: path.to_owned(),
         source,
@@ -238,15 +255,18 @@ pub fn scan(path: &Path, expansion: Expansion, each: &mut Visitor<'_>) -> Result
     scan_records(&mut records, each).map_err(wrong)
 }
 
-/// Does the same as [`scan`], but also visits the messages at the beginning of a truncated chunk.
+/// Does the same as [`scan`] until the visitor breaks, but also visits the messages at the beginning
+/// of a truncated chunk.
 pub(super) fn scan_with_cut(
     path: &Path,
     expansion: Expansion,
-    each: &mut Visitor<'_>,
+    each: &mut StoppingVisitor<'_>,
 ) -> Result<Scan, ReadError> {
-    let mut scan = scan(path, expansion, each)?;
+    let mut scan = scan_until(path, expansion, each)?;
     let cut = std::mem::take(&mut scan.cut);
-    take_chunk(&cut, &mut scan, each);
+    if !scan.is_stopped {
+        take_chunk(&cut, &mut scan, each);
+    }
     Ok(scan)
 }
 
@@ -256,7 +276,7 @@ pub(super) fn compression(path: &Path) -> Compression {
     suffix.and_then(Compression::named).unwrap_or_default()
 }
 
-fn scan_records(records: &mut Records<'_>, each: &mut Visitor<'_>) -> io::Result<Scan> {
+fn scan_records(records: &mut Records<'_>, each: &mut StoppingVisitor<'_>) -> io::Result<Scan> {
     let mut scan = Scan {
         end: records.position,
         ..Scan::default()
@@ -323,6 +343,9 @@ fn scan_records(records: &mut Records<'_>, each: &mut Visitor<'_>) -> io::Result
             _ => scan.contents.take(opcode, &content),
         }
         scan.end = records.position;
+        if scan.is_stopped {
+            return Ok(scan);
+        }
     }
 }
 
@@ -382,7 +405,7 @@ fn read_chunk(
     in_memory: u64,
     left: &mut u64,
     scan: &mut Scan,
-    each: &mut Visitor<'_>,
+    each: &mut StoppingVisitor<'_>,
 ) -> io::Result<BTreeMap<u16, Vec<(u64, u64)>>> {
     let records = match Compression::named(chunk.compression) {
         Some(Compression::None) => return Ok(take_chunk(chunk.records, scan, each)),
@@ -420,7 +443,7 @@ fn expands_too_far(factor: u64) -> io::Error {
 fn take_chunk(
     records: &[u8],
     scan: &mut Scan,
-    each: &mut Visitor<'_>,
+    each: &mut StoppingVisitor<'_>,
 ) -> BTreeMap<u16, Vec<(u64, u64)>> {
     let mut index: BTreeMap<u16, Vec<(u64, u64)>> = BTreeMap::new();
     let mut rest = records;
@@ -433,6 +456,9 @@ fn take_chunk(
             let entries = index.entry(message.channel_id).or_default();
             entries.push((message.log_time, offset));
             take_message(&message, scan, each);
+            if scan.is_stopped {
+                return index;
+            }
         }
     }
     if !rest.is_empty() {
@@ -441,10 +467,10 @@ fn take_chunk(
     index
 }
 
-fn take_message(message: &Message<'_>, scan: &mut Scan, each: &mut Visitor<'_>) {
+fn take_message(message: &Message<'_>, scan: &mut Scan, each: &mut StoppingVisitor<'_>) {
     scan.contents.count(message);
     *scan.sizes.entry(message.channel_id).or_default() += message.data.len() as u64;
-    each(message, &scan.contents);
+    scan.is_stopped |= each(message, &scan.contents).is_break();
 }
 
 /// Returns the complete records at the beginning of a truncated chunk's record.

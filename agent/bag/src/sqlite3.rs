@@ -3,14 +3,14 @@
 //!
 //! The file format is that of <https://www.sqlite.org/fileformat.html>: trees of pages. Only the
 //! trees of tables are read, not the indexes, the write-ahead log and the free list. Page numbers
-//! and lengths are not trusted: the number of pages read is bounded, and payloads are read up to
-//! [`PREFIX`] bytes.
+//! and lengths are not trusted: the number of pages read is bounded, and so is the length of a row.
 
 mod page;
 mod row;
 
 use std::collections::HashMap;
 use std::io;
+use std::ops::ControlFlow;
 use std::path::Path;
 
 use super::messages::Message;
@@ -18,14 +18,18 @@ use super::open_file;
 use page::Pages;
 use row::Value;
 
-/// Maximum number of bytes of a row that are read; beyond them is the end of a large message, or
-/// QoS.
-const PREFIX: usize = 1024;
+/// Number of bytes of a row that hold all but the end of a large message, or QoS.
+pub(super) const PREFIX: usize = 1024;
 /// Maximum length of the name of a topic or type, in bytes.
 const MAX_NAME: usize = 256;
 
-/// Reads all messages. Returns the number of damaged pages and rows.
-pub(super) fn read(path: &Path, each: &mut dyn FnMut(&Message<'_>)) -> io::Result<u64> {
+/// Reads the messages until `each` breaks, up to `longest` bytes of a row. Returns the number of
+/// damaged pages and rows.
+pub(super) fn read(
+    path: &Path,
+    longest: usize,
+    each: &mut dyn FnMut(&Message<'_>) -> ControlFlow<()>,
+) -> io::Result<u64> {
     let mut pages = Pages::open(open_file(path)?)?;
     let mut tables: HashMap<String, Table> = HashMap::new();
     pages.visit(1, PREFIX, &mut |_, row| {
@@ -41,6 +45,7 @@ pub(super) fn read(path: &Path, each: &mut dyn FnMut(&Message<'_>)) -> io::Resul
             let columns = columns(sql);
             tables.insert(name.to_owned(), Table { root, columns });
         }
+        ControlFlow::Continue(())
     })?;
     let (Some(topics), Some(messages)) = (tables.get("topics"), tables.get("messages")) else {
         return Err(not_a_bag());
@@ -63,19 +68,20 @@ pub(super) fn read(path: &Path, each: &mut dyn FnMut(&Message<'_>)) -> io::Resul
         {
             named.insert(id, (name.to_owned(), type_name.to_owned()));
         }
+        ControlFlow::Continue(())
     })?;
     let topic_id = messages.place(&["topic_id"])?;
     let received = messages.place(&["timestamp", "recv_timestamp"])?;
     let sent = messages.place(&["send_timestamp"]).ok();
     let data = messages.place(&["data"])?;
-    pages.visit(messages.root, PREFIX, &mut |_, row| {
+    pages.visit(messages.root, longest, &mut |_, row| {
         let integer = |place| row.value(place).and_then(Value::integer);
         let topic = integer(topic_id).and_then(|id| named.get(&id));
         let received = integer(received).and_then(|time| u64::try_from(time).ok());
         if let (Some((topic, type_name)), Some(log_time), Some(Value::Blob(begin))) =
             (topic, received, row.value(data))
         {
-            each(&Message {
+            return each(&Message {
                 topic,
                 type_name,
                 definition: "",
@@ -86,6 +92,7 @@ pub(super) fn read(path: &Path, each: &mut dyn FnMut(&Message<'_>)) -> io::Resul
                 begin,
             });
         }
+        ControlFlow::Continue(())
     })?;
     Ok(pages.damaged())
 }

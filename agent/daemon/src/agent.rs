@@ -25,8 +25,9 @@ use crate::logging::Log;
 use crate::private_agent::PrivateAgent;
 use crate::privilege::{self, Identity, Role, Sandbox, Unprivileged};
 use crate::recording::{self, Recordings, Refusal, Snapshots};
+use crate::replay_pace::Jump;
 use crate::run::replay::Replay;
-use crate::run::{Outputs, Run, Source};
+use crate::run::{Outputs, Restart, Run, Source};
 use crate::settings_cell::Settings;
 use crate::state::{StateDirectory, StateWriter};
 use crate::subscriptions::{Caps, Subscriptions};
@@ -111,6 +112,8 @@ pub struct Components<'a> {
     pub library: Arc<Library>,
     /// Time span of the figures kept for topics; zero means none.
     pub history: Duration,
+    /// Makes another model for a replay that goes back. `None` means that it ends with its capture.
+    pub restart: Option<Box<dyn Fn() -> Observer + Send>>,
     /// Addresses at which the page is served.
     pub addresses: Vec<SocketAddr>,
     /// Examines this host for clients.
@@ -196,8 +199,11 @@ impl Components<'_> {
             Arc::clone(&subscriptions),
             self.stop.clone(),
         );
-        let topics = config.limits.topics;
-        let history = (!self.history.is_zero()).then(|| History::new(self.history, topics));
+        let (span, topics) = (self.history, config.limits.topics);
+        let new_history = move || (!span.is_zero()).then(|| History::new(span, topics));
+        let restart = self
+            .restart
+            .map(|observer| -> Restart { Box::new(move || (observer(), new_history())) });
         let (reloader, reloads) = reload::channel();
         let context = api::Context {
             latest: sources.latest,
@@ -221,7 +227,8 @@ impl Components<'_> {
         Ok(AssembledAgent {
             run: run
                 .with_state_writer(self.state_writer)
-                .with_history(history),
+                .with_history(new_history())
+                .with_restart(restart),
             context,
             reloads,
         })
@@ -251,6 +258,9 @@ pub fn run(options: Options) -> Result<()> {
         }
     }
     let mut sources = MetricSources::new(source.kind(), Settings::new(&config));
+    if !options.report {
+        pause_at_incident(&source, &sources);
+    }
     sources.lost_lines = log.lost_lines();
     let library = Arc::new(library());
     sources.fields = Arc::new(FieldMetrics::new(&config.extractions, Arc::clone(&library)));
@@ -313,11 +323,11 @@ pub fn run(options: Options) -> Result<()> {
     let powerless = drop_privileges()?;
     report_listeners(server.as_ref(), &control, viewers.as_ref(), &watches);
 
-    let mut observer = Observer::new(settings(&config, options.replay.is_none()));
-    observer.input(Input::ExpectedChains(Arc::new(config.chains.clone())));
-    observer.input(Input::RobotExpectations(config.expectations()));
+    let new_observer = observers(&config, options.replay.is_none());
+    let mut observer = new_observer();
     state.restore(&mut observer, &source);
     let stop = CancellationToken::new();
+    let is_replay = matches!(source, Source::Replay(_));
     let components = Components {
         config: &config,
         source,
@@ -333,6 +343,8 @@ pub fn run(options: Options) -> Result<()> {
         receipts: receipts.filter(|_| config.ship.url.is_some()),
         library,
         history: kept,
+        restart: (is_replay && !options.report)
+            .then(|| -> Box<dyn Fn() -> Observer + Send> { Box::new(new_observer) }),
         addresses: page_addresses(&config, &control),
         doctor: options.doctor,
         stop: stop.clone(),
@@ -376,6 +388,24 @@ pub fn run(options: Options) -> Result<()> {
         print!("{}", Exposition::new(sources).render(Format::Classic)?);
     }
     Ok(())
+}
+
+/// Makes the replay of a snapshot's bag go to the event that triggered it, and pause there.
+fn pause_at_incident(source: &Source, sources: &MetricSources) {
+    if let Source::Replay(replay) = source
+        && let Some((time, trigger)) = replay.incident()
+    {
+        sources.latest.replay_pace().change(|pace| {
+            pace.jump = Some(Jump::To(*time));
+            pace.is_paused = true;
+        });
+        let (event, time) = (&trigger.event, &trigger.time);
+        tracing::info!(
+            event,
+            time,
+            "the replay pauses at the event that triggered the bag"
+        );
+    }
 }
 
 /// Returns the configuration with the overrides of the command line.
@@ -619,6 +649,19 @@ fn report_listeners(
     }
     if let Some(address) = viewers.and_then(foxglove::Server::address) {
         tracing::info!(%address, "serving viewers over the Foxglove protocol");
+    }
+}
+
+/// Returns a function that makes models with what the configuration expects of chains and robot.
+fn observers(config: &Config, is_live: bool) -> impl Fn() -> Observer + Send + use<> {
+    let settings = settings(config, is_live);
+    let chains = Arc::new(config.chains.clone());
+    let expectations = config.expectations();
+    move || {
+        let mut observer = Observer::new(settings);
+        observer.input(Input::ExpectedChains(Arc::clone(&chains)));
+        observer.input(Input::RobotExpectations(expectations.clone()));
+        observer
     }
 }
 

@@ -8,6 +8,7 @@ use ros2probe_wire::Timestamp;
 use crate::privilege::{self, Sandbox};
 use crate::replay_pace::Pace;
 use crate::state::StateFacts;
+use ros2probe_api::recordings::BagTrigger;
 use ros2probe_capture::pcap::Speed;
 use ros2probe_model::facts::dispatch::MissedReason;
 
@@ -47,6 +48,10 @@ pub struct AgentFacts {
     pub replay_speed: Option<Speed>,
     /// How clients want the replay to go on.
     pub replay_pace: Pace,
+    /// Parts of a bag that were not replayed, as lines for people.
+    pub replay_faults: Vec<String>,
+    /// What triggered the bag in replay, if a snapshot wrote it.
+    pub replay_incident: Option<BagTrigger>,
     /// Packets of a capture with an unsupported link layer, by link-layer number.
     pub unsupported_packets: Vec<(u16, u64)>,
     /// Counters per interface, or per network namespace if the kernel has no finer ones.
@@ -210,6 +215,8 @@ impl AgentFacts {
             replayed: None,
             replay_speed: None,
             replay_pace: Pace::default(),
+            replay_faults: Vec::new(),
+            replay_incident: None,
             unsupported_packets: Vec::new(),
             interfaces: Vec::new(),
             filter_events: Vec::new(),

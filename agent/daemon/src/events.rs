@@ -44,7 +44,8 @@ const MAX_EVENTS_PER_SECOND: u32 = 200;
 /// Log of the latest events.
 #[derive(Debug)]
 pub struct EventLog {
-    run: Run,
+    /// The run, in microseconds of its start. A replay that goes back begins another one.
+    run: AtomicU64,
     started: Instant,
     log: Mutex<Log>,
     recorded: Notify,
@@ -80,6 +81,8 @@ struct Log {
     kept: Bounded<KeptEvents, VecDeque<Arc<Entry>>>,
     /// Number of the latest event.
     last: u64,
+    /// Number of the latest event of an earlier run, which no reader misses.
+    before: u64,
     recorded: BTreeMap<&'static str, u64>,
     /// Counts of robot events, in seconds of the source's clock.
     robot: RateLimit,
@@ -115,7 +118,7 @@ impl EventLog {
     #[must_use]
     pub fn new() -> Self {
         Self {
-            run: Run(wall_clock().0 / 1000),
+            run: AtomicU64::new(wall_clock().0 / 1000),
             started: Instant::now(),
             log: Mutex::default(),
             recorded: Notify::new(),
@@ -162,6 +165,7 @@ impl EventLog {
     pub fn read(&self, after: u64, most: usize) -> Batch {
         let log = self.log();
         let before_first = log.last - log.kept.len() as u64;
+        let after = after.max(log.before);
         let kept_after = after.clamp(before_first, log.last);
         let skip = usize::try_from(kept_after - before_first).unwrap_or(usize::MAX);
         let entries: Vec<_> = log
@@ -200,13 +204,28 @@ impl EventLog {
     /// Returns the id of the event with this number.
     #[must_use]
     pub fn id(&self, number: u64) -> String {
-        format!("{}-{number}", self.run)
+        format!("{}-{number}", self.number_of_run())
     }
 
     /// Returns the identifier of this run of the agent.
     #[must_use]
     pub fn run(&self) -> String {
-        self.run.to_string()
+        self.number_of_run().to_string()
+    }
+
+    /// Begins another run without events, for a replay that goes back. Numbers of events go on.
+    pub fn begin_run(&self) {
+        let mut log = self.log();
+        let Run(earlier) = self.number_of_run();
+        let now = (wall_clock().0 / 1000).max(earlier + 1);
+        self.run.store(now, Ordering::Release);
+        log.kept.clear();
+        log.before = log.last;
+        (log.robot, log.agent) = (RateLimit::default(), RateLimit::default());
+    }
+
+    fn number_of_run(&self) -> Run {
+        Run(self.run.load(Ordering::Acquire))
     }
 
     /// Returns the position of an id relative to this run; `None` if the text is not an id.
@@ -215,7 +234,7 @@ impl EventLog {
         let (run, number) = id.split_once('-')?;
         let run = Run(u64::from_str_radix(run, 16).ok()?);
         let number = number.parse().ok()?;
-        let ours = run == self.run && number <= self.last();
+        let ours = run == self.number_of_run() && number <= self.last();
         Some(if ours {
             Position::After(number)
         } else {

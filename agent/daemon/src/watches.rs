@@ -320,6 +320,14 @@ impl Watches {
         self.active.load_full()
     }
 
+    /// For the capture thread: a replay begins again. The watches count as changed.
+    pub fn begin_again(&self) {
+        let lists = self.lists.lock().unwrap_or_else(PoisonError::into_inner);
+        self.unread
+            .store(Some(Arc::clone(&self.active().watchlist)));
+        drop(lists);
+    }
+
     /// For the capture thread: returns the watches, if they changed since the last call.
     #[must_use]
     pub fn take_changed(&self) -> Option<Arc<Watchlist>> {

@@ -8,7 +8,7 @@ Object.assign(globalThis, {
   document: { addEventListener() {}, visibilityState: 'visible' },
   window: { addEventListener() {} },
 });
-const { eventsOf, inWords, marksOf, showTime, timeOf } = await import('../timebar.js');
+const { eventBefore, eventsOf, inWords, marksOf, showTime, timeOf } = await import('../timebar.js');
 
 test('the time of an address is bounded', () => {
   assert.deepEqual(timeOf({}), { span: 600, at: null });
@@ -49,4 +49,14 @@ test('the events of a topic mark its charts, and warnings about no topic', () =>
   const own = eventsOf(all, '/a');
   assert.deepEqual(own, [all[0], all[2]]);
   assert.deepEqual(marksOf(own), [{ time: 5, severity: 'INFO' }, { time: 5, severity: 'ERROR' }]);
+});
+
+test('the event before a time is no arrival of a participant or endpoint', () => {
+  const event = (/** @type {string} */ name, /** @type {number} */ seconds) => /** @type {any} */ ({
+    id: String(seconds), name, severity: 'INFO', time: new Date(seconds * 1000).toISOString(), attributes: {},
+  });
+  const events = [event('ros2.message.lost', 10), event('ros2.endpoint.discovered', 12), event('ros2.topic.x', 15)];
+  assert.equal(eventBefore(events, 20), 15);
+  assert.equal(eventBefore(events, 15.5), 10);
+  assert.equal(eventBefore(events, 10), null);
 });

@@ -3,6 +3,7 @@
 use std::collections::HashSet;
 use std::fs::File;
 use std::io;
+use std::ops::ControlFlow;
 use std::os::unix::fs::FileExt as _;
 
 use super::row::{Row, varint};
@@ -25,7 +26,7 @@ pub(super) struct Pages {
 }
 
 /// Called for each row with its number.
-pub(super) type Visitor<'a> = dyn FnMut(i64, &Row<'_>) + 'a;
+pub(super) type Visitor<'a> = dyn FnMut(i64, &Row<'_>) -> ControlFlow<()> + 'a;
 
 impl Pages {
     pub(super) fn open(file: File) -> io::Result<Self> {
@@ -55,7 +56,8 @@ impl Pages {
         self.damaged
     }
 
-    /// Visits the rows of the table with this root in their order, each up to `limit` bytes.
+    /// Visits the rows of the table with this root in their order, each up to `limit` bytes, until
+    /// the visitor breaks.
     pub(super) fn visit(
         &mut self,
         root: u32,
@@ -67,7 +69,10 @@ impl Pages {
         let mut levels: Vec<Vec<u32>> = vec![vec![root]];
         let mut interior = HashSet::new();
         let mut leaves = 0_u64;
-        let most = self.file.metadata()?.len() / self.page_size as u64 + 1;
+        let file_length = self.file.metadata()?.len();
+        let most = file_length / self.page_size as u64 + 1;
+        // The overflow pages of a damaged row may form a circle.
+        let limit = limit.min(usize::try_from(file_length).unwrap_or(usize::MAX));
         let mut row = Vec::new();
         while let Some(level) = levels.last_mut() {
             let Some(number) = level.pop() else {
@@ -88,7 +93,8 @@ impl Pages {
                     leaves += 1;
                     for cell in cells(&page, start, 8) {
                         match self.row(&page, cell, limit, &mut row) {
-                            Some(id) => each(id, &Row::new(&row)),
+                            Some(id) if each(id, &Row::new(&row)).is_break() => return Ok(()),
+                            Some(_) => {}
                             None => self.damaged += 1,
                         }
                     }

@@ -25,7 +25,8 @@ pub(crate) struct Run {
     /// Configuration file [default: /etc/ros2probe/ros2probe.yaml, if it exists]
     #[arg(long, value_name = "FILE")]
     pub(crate) config: Option<PathBuf>,
-    /// Observe a capture (pcap or pcapng, may be gzipped) instead of this host; needs no privilege
+    /// Observe a capture (pcap or pcapng, may be gzipped) or a bag of rosbag2 instead of this host;
+    /// needs no privilege
     #[arg(long, value_name = "FILE")]
     pub(crate) replay: Option<PathBuf>,
     /// How fast to replay: a factor, or `max` [default: 1, with --report max]

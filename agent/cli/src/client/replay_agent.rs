@@ -9,8 +9,9 @@ use std::time::{Duration, Instant};
 use ros2probe_capture::pcap::{PcapError, Speed, link_name};
 use ros2probe_capture::reassembly::Limits;
 use ros2probe_daemon::agent::{AssembledAgent, Components};
+use ros2probe_daemon::agent_facts::AgentFacts;
 use ros2probe_daemon::config::{Config, RetainChoice, Watch};
-use ros2probe_daemon::run::replay::{Replay, ReplayControl, pause_at};
+use ros2probe_daemon::run::replay::{self, BagError, Replay, ReplayControl, pause_at};
 use ros2probe_daemon::run::{CaptureTime, Run, RunError, Source};
 use ros2probe_daemon::settings_cell::Settings;
 use ros2probe_daemon::snapshot_cell::SnapshotCell;
@@ -83,9 +84,9 @@ pub struct Outcome {
 /// A capture cannot be replayed.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum ReplayError {
-    /// The file is not a capture, or cannot be read.
+    /// The file is neither a capture nor a bag, or cannot be read.
     #[error(transparent)]
-    Capture(PcapError),
+    Capture(replay::ReplayError),
     /// The agent could not be started.
     #[error(transparent)]
     Start(io::Error),
@@ -123,8 +124,8 @@ impl ReplayAgent {
         match &mut control {
             None if is_live => {}
             None => {
-                if let Ok(Some(RunError::Replay(error @ PcapError::UnsupportedLink { .. }))) =
-                    ended.await
+                if let Ok(Some(RunError::Replay(error))) = ended.await
+                    && is_unusable(&error)
                 {
                     return Err(ReplayError::Capture(error));
                 }
@@ -258,6 +259,7 @@ fn assemble(
         receipts: None,
         library: Arc::new(Library::new(Sources::default())),
         history: Duration::ZERO,
+        restart: None,
         addresses: Vec::new(),
         doctor: crate::doctor::of_agent(),
         stop,
@@ -290,14 +292,15 @@ fn spawn(
     let stored = Arc::clone(&outcome);
     let work = move || {
         let result = run.run();
-        let unsupported = latest.state().agent.unsupported_packets.clone();
+        let state = latest.state();
         if let Some(Report { file, print }) = report {
-            let lines = capture_faults(&file, &result, &unsupported);
+            let lines = capture_faults(&file, &result, &state.agent);
             lines.iter().for_each(|line| print(line));
         }
+        let unsupported = state.agent.unsupported_packets.iter();
         let _ = stored.set(Outcome {
             fault: result.as_ref().err().map(ToString::to_string),
-            unsupported_packets: unsupported.iter().map(|(_, packets)| packets).sum(),
+            unsupported_packets: unsupported.map(|(_, packets)| packets).sum(),
         });
         let _ = sender.send(result.err());
     };
@@ -306,18 +309,30 @@ fn spawn(
     Ok(Running { outcome, ended })
 }
 
-/// Returns the unreadable parts of a capture with their remedies, one per line.
+/// Returns whether nothing of a capture or bag can be read. The command's own error then covers it.
+const fn is_unusable(error: &replay::ReplayError) -> bool {
+    use replay::ReplayError;
+    matches!(
+        error,
+        ReplayError::Capture(PcapError::UnsupportedLink { .. })
+            | ReplayError::Bag(BagError::Messages(_))
+    )
+}
+
+/// Returns the unreadable parts of a capture or bag with their remedies, one per line.
 fn capture_faults(
     capture: &Path,
     result: &Result<(), RunError>,
-    unsupported: &[(u16, u64)],
+    facts: &AgentFacts,
 ) -> Vec<String> {
+    let (unsupported, bag_faults) = (&facts.unsupported_packets, &facts.replay_faults);
     let capture = capture.display();
     let mut lines = Vec::new();
     match result {
-        // The command's own error covers it.
-        Err(RunError::Replay(PcapError::UnsupportedLink { .. })) => return lines,
-        Err(RunError::Replay(error @ (PcapError::Truncated { .. } | PcapError::Read { .. }))) => {
+        Err(RunError::Replay(error)) if is_unusable(error) => return lines,
+        Err(RunError::Replay(replay::ReplayError::Capture(
+            error @ (PcapError::Truncated { .. } | PcapError::Read { .. }),
+        ))) => {
             lines.push(format!(
                 "{capture} is incomplete: {error}; the rest is missing. Copy it again, or let \
                  tcpdump end by itself"
@@ -329,6 +344,7 @@ fn capture_faults(
         Err(error) => lines.push(error.to_string()),
         Ok(()) => {}
     }
+    lines.extend(bag_faults.iter().cloned());
     for (link, packets) in unsupported {
         let link = link_name(Link(*link));
         lines.push(format!(

@@ -26,7 +26,7 @@ pub struct Target {
     /// The agent behind this unix socket [default: /run/ros2probe/api.sock, then loopback]
     #[arg(long, value_name = "PATH")]
     pub socket: Option<PathBuf>,
-    /// Query a capture (pcap or pcapng, may be gzipped) instead of an agent
+    /// Query a capture (pcap or pcapng, may be gzipped) or a bag instead of an agent
     #[arg(long, value_name = "FILE", conflicts_with_all = ["host", "socket"])]
     pub replay: Option<PathBuf>,
     /// Start at this time of the capture: Unix seconds, or +S from its beginning

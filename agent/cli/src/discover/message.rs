@@ -1,18 +1,19 @@
 //! The few RTPS messages that `rp discover` sends, byte for byte (RTPS 2.5, 8.3 and 9.4).
 //!
-//! The only encoder of RTPS in the product. It announces a bare participant and one reader of
-//! `ros_discovery_info`, requests samples, and says goodbye. All messages carry the identity of
-//! that participant.
+//! They announce a bare participant and one reader of `ros_discovery_info`, request samples, and
+//! say goodbye. All messages carry the identity of that participant.
 
 use std::net::SocketAddrV4;
 
+pub use ros2probe_wire::encode::VENDOR;
+use ros2probe_wire::encode::{
+    self, NO_FLAGS, PL_CDR_LE, Parameters, data_head, sequence_number, text,
+};
 use ros2probe_wire::parameters::ParameterId;
 use ros2probe_wire::qos::{Durability, Reliability};
-use ros2probe_wire::rtps::{LocatorKind, SubmessageFlags, SubmessageId, VendorId};
+use ros2probe_wire::rtps::{LocatorKind, SubmessageFlags, SubmessageId};
 use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, SequenceNumber};
 
-/// Vendor id, believed to be unassigned. Both vendors treat it as foreign and use no extensions.
-pub const VENDOR: VendorId = VendorId([0x01, 0x7f]);
 /// Entity id of the reader of `ros_discovery_info`: user-defined, without key.
 pub const NODES_READER: EntityId = EntityId([0x00, 0x00, 0x0a, 0x04]);
 /// Reader of SEDP publication announcements.
@@ -31,9 +32,6 @@ const LEASE_SECONDS: u32 = 3;
 /// Maximum number of sequence numbers in one ACKNACK (RTPS 2.5, 9.4.2.6).
 pub const MAX_NUMBERS: u64 = 256;
 
-/// No flags. The encoder adds flag E to each submessage.
-const NO_FLAGS: SubmessageFlags = SubmessageFlags(0);
-const PL_CDR_LE: [u8; 4] = [0x00, 0x03, 0x00, 0x00];
 /// Disposed and unregistered; STATUS_INFO is always big-endian (RTPS 2.5, 9.6.4.9).
 const DISPOSED_UNREGISTERED: [u8; 4] = [0, 0, 0, 3];
 
@@ -50,14 +48,14 @@ pub struct LocalParticipant {
 
 /// A message under construction.
 #[derive(Debug)]
-pub struct Message(Vec<u8>);
+pub struct Message(encode::Message);
 
 impl Message {
     /// Begins a message from the local participant to one participant.
     #[must_use]
     pub fn new(local: LocalParticipant, target: GuidPrefix) -> Self {
-        let header = [&b"RTPS\x02\x03"[..], &VENDOR.0, &local.prefix.0];
-        Self(header.concat()).submessage(SubmessageId::INFO_DST, NO_FLAGS, &[&target.0])
+        let message = Self(encode::Message::new(local.prefix));
+        message.submessage(SubmessageId::INFO_DST, NO_FLAGS, &[&target.0])
     }
 
     /// Adds the SPDP announcement.
@@ -100,7 +98,7 @@ impl Message {
             .add(ParameterId::KEY_HASH, &own.to_bytes())
             .add(ParameterId::STATUS_INFO, &DISPOSED_UNREGISTERED)
             .end();
-        let head = data_head(SPDP_READER, EntityId::SPDP_WRITER, 2);
+        let head = data_head(SPDP_READER, EntityId::SPDP_WRITER, SequenceNumber(2));
         self.submessage(
             SubmessageId::DATA,
             SubmessageFlags::INLINE_QOS,
@@ -131,7 +129,7 @@ impl Message {
             )
             .end();
         let (reader, writer) = (SUBSCRIPTIONS_READER, EntityId::SEDP_SUBSCRIPTIONS_WRITER);
-        let numbers = [number(SequenceNumber::FIRST); 2].concat();
+        let numbers = [sequence_number(SequenceNumber::FIRST); 2].concat();
         let heartbeat = [&reader.0[..], &writer.0, &numbers, &1u32.to_le_bytes()];
         self.data(reader, writer, 1, &payload).submessage(
             SubmessageId::HEARTBEAT,
@@ -153,7 +151,13 @@ impl Message {
     ) -> Self {
         let set = bitmap(base.0, missing.into_iter().map(|number| number.0));
         let count = count.to_le_bytes();
-        let body = [&reader.0[..], &writer.0, &number(base), &set, &count];
+        let body = [
+            &reader.0[..],
+            &writer.0,
+            &sequence_number(base),
+            &set,
+            &count,
+        ];
         self.submessage(SubmessageId::ACKNACK, SubmessageFlags::FINAL, &body)
     }
 
@@ -176,7 +180,7 @@ impl Message {
         let body = [
             &reader.0[..],
             &writer.0,
-            &number(sample),
+            &sequence_number(sample),
             &base,
             &set,
             &count,
@@ -187,33 +191,20 @@ impl Message {
     /// Returns the bytes of the message.
     #[must_use]
     pub fn bytes(self) -> Vec<u8> {
-        self.0
+        self.0.bytes()
     }
 
     fn data(self, reader: EntityId, writer: EntityId, number: u32, payload: &[u8]) -> Self {
-        let head = data_head(reader, writer, number);
-        let body = [&head[..], &PL_CDR_LE, payload];
-        self.submessage(SubmessageId::DATA, SubmessageFlags::DATA, &body)
+        let number = SequenceNumber(number.into());
+        Self(
+            self.0
+                .data((reader, writer), number, &[&PL_CDR_LE, payload]),
+        )
     }
 
-    fn submessage(mut self, id: SubmessageId, flags: SubmessageFlags, body: &[&[u8]]) -> Self {
-        let body = body.concat();
-        // Bodies of these messages have a few hundred bytes at most.
-        let length = u16::try_from(body.len()).unwrap_or(0);
-        let flags = flags.with(SubmessageFlags::ENDIANNESS);
-        self.0.extend_from_slice(&[id.0, flags.0]);
-        self.0.extend_from_slice(&length.to_le_bytes());
-        self.0.extend_from_slice(&body);
-        self
+    fn submessage(self, id: SubmessageId, flags: SubmessageFlags, body: &[&[u8]]) -> Self {
+        Self(self.0.submessage(id, flags, body))
     }
-}
-
-/// Fixed first part of a DATA submessage (RTPS 2.5, 9.4.5.4).
-fn data_head(reader: EntityId, writer: EntityId, sequence_number: u32) -> Vec<u8> {
-    // extraFlags, octetsToInlineQos.
-    let fixed = [0, 0, 16, 0];
-    let number = number(SequenceNumber(sequence_number.into()));
-    [&fixed[..], &reader.0, &writer.0, &number].concat()
 }
 
 /// Returns numBits and bitmap of a set of sequence numbers that begins at `base` (RTPS 2.5,
@@ -236,41 +227,10 @@ fn bitmap(base: u64, numbers: impl IntoIterator<Item = u64>) -> Vec<u8> {
     words.flat_map(|word| word.to_le_bytes()).collect()
 }
 
-/// Encodes a sequence number: high word, low word (RTPS 2.5, 9.3.2.5).
-fn number(number: SequenceNumber) -> [u8; 8] {
-    number.0.rotate_left(32).to_le_bytes()
-}
-
 fn locator(address: std::net::Ipv4Addr, port: u16) -> Vec<u8> {
     let kind = LocatorKind::UDP_V4.0.to_le_bytes();
     let port = u32::from(port).to_le_bytes();
     [&kind[..], &port, &[0; 12], &address.octets()].concat()
-}
-
-/// Encodes a CDR string.
-fn text(text: &[u8]) -> Vec<u8> {
-    let length = u32::try_from(text.len() + 1).unwrap_or(0);
-    [&length.to_le_bytes()[..], text, &[0]].concat()
-}
-
-/// Parameter list (RTPS 2.5, 9.4.2.11).
-#[derive(Default)]
-struct Parameters(Vec<u8>);
-
-impl Parameters {
-    fn add(mut self, id: ParameterId, value: &[u8]) -> Self {
-        let padded = value.len().next_multiple_of(4);
-        let length = u16::try_from(padded).unwrap_or(0);
-        self.0.extend_from_slice(&id.0.to_le_bytes());
-        self.0.extend_from_slice(&length.to_le_bytes());
-        self.0.extend_from_slice(value);
-        self.0.resize(self.0.len() + padded - value.len(), 0);
-        self
-    }
-
-    fn end(self) -> Vec<u8> {
-        self.add(ParameterId::SENTINEL, &[]).0
-    }
 }
 
 #[cfg(test)]

@@ -33,4 +33,13 @@ await scenario(async (open) => {
   await button('Play').click();
   await reads(bar, /finished/);
   await gone(button('Pause'));
+
+  // From the end, it goes back to an event, and to the begin.
+  const end = await time();
+  await button('Previous event').click();
+  await until('an earlier time', async () => await time() !== end && !/finished/.test(await bar.innerText()));
+  await button('Pause').click();
+  await button('Begin').click();
+  await until('the begin', async () => /, 0(\.\d+)? ?s after the begin/.test(await bar.innerText()));
+  await tab.live();
 });

@@ -14,20 +14,20 @@ use tempfile::TempDir;
 
 use crate::ros2::{run, stderr, stdout};
 
-const CAPTURE: &str = "agent/testing/data/fastrtps-udp/chain-1ns/capture.pcap.gz";
+pub(crate) const CAPTURE: &str = "agent/testing/data/fastrtps-udp/chain-1ns/capture.pcap.gz";
 
 /// A recorded message with its whole payload.
 #[derive(Clone)]
-struct Recorded {
-    topic: String,
-    type_name: String,
-    log_time: u64,
-    publish_time: u64,
-    data: Vec<u8>,
+pub(crate) struct Recorded {
+    pub(crate) topic: String,
+    pub(crate) type_name: String,
+    pub(crate) log_time: u64,
+    pub(crate) publish_time: u64,
+    pub(crate) data: Vec<u8>,
 }
 
 /// Converts the capture to a bag.
-fn converted(directory: &Path) -> PathBuf {
+pub(crate) fn converted(directory: &Path) -> PathBuf {
     let bag = directory.join("drive");
     let capture = repository(CAPTURE);
     let paths = [capture.to_str().unwrap(), bag.to_str().unwrap()];
@@ -36,7 +36,7 @@ fn converted(directory: &Path) -> PathBuf {
     bag
 }
 
-fn recorded(bag: &Path) -> Vec<Recorded> {
+pub(crate) fn recorded(bag: &Path) -> Vec<Recorded> {
     let mut all = Vec::new();
     let read = messages::read(bag, Expansion::Limited, &mut |message, _| {
         all.push(Recorded {
@@ -79,7 +79,7 @@ fn mcap(path: &Path, messages: &[Recorded]) {
 }
 
 /// Writes a bag in sqlite3 storage with these messages.
-fn sqlite3(directory: &Path, messages: &[Recorded]) -> PathBuf {
+pub(crate) fn sqlite3(directory: &Path, messages: &[Recorded]) -> PathBuf {
     let bag = directory.join("lite");
     let mut python = Command::new(repository("target/tools/bags/bin/python"))
         .arg(repository("agent/cli/tests/surface/bag_chains.py"))

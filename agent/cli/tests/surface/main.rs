@@ -14,6 +14,7 @@ mod api_views;
 mod attach;
 mod bag;
 mod bag_chains;
+mod bag_replay;
 mod caps;
 mod chains;
 mod ci;

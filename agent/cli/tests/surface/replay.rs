@@ -65,8 +65,9 @@ fn a_replay_pauses_and_jumps_to_a_time_and_to_the_next_event() {
     let held = get(&agent, "/replay");
     std::thread::sleep(Duration::from_millis(1_500));
     assert_eq!(time(&get(&agent, "/replay")), time(&held));
-    let past = json!({"to_timestamp_seconds": time(&held) - 1.0});
-    let (status, _) = call_api(agent.api, "POST", "/replay", &past.to_string());
+    let begin = held["begin_timestamp_seconds"].as_f64().unwrap();
+    let before = json!({"to_timestamp_seconds": begin - 1.0});
+    let (status, _) = call_api(agent.api, "POST", "/replay", &before.to_string());
     assert_eq!(status, 422);
 
     // A jump ends exactly at its time, and the replay stands still again.
@@ -100,4 +101,67 @@ fn a_replay_pauses_and_jumps_to_a_time_and_to_the_next_event() {
     // Nothing follows that it could jump to.
     let ended = change(&agent, &json!({"to_next_event": true}));
     assert_eq!(ended["is_jumping"], false);
+}
+
+/// Returns the counted messages of each topic.
+fn counts(agent: &LocalAgent) -> Vec<(String, Value)> {
+    let topics = get(agent, "/topics?hidden=true");
+    let topics = topics["topics"].as_array().unwrap().iter();
+    let mut counts: Vec<_> = topics
+        .map(|topic| {
+            let name = topic["name"].as_str().unwrap().to_owned();
+            (name, topic["measurement"]["messages"].clone())
+        })
+        .collect();
+    counts.sort_by(|a, b| a.0.cmp(&b.0));
+    counts
+}
+
+#[test]
+fn a_replay_goes_back_also_from_its_end_and_shows_the_same_again() {
+    let capture = data("cyclonedds/points-besteffort-lossy-2ns");
+    let agent = LocalAgent::replay(&mut rp(), &capture, &["--watch", "/**", "--speed", "0.1"]);
+    let begun = wait_for(&agent, "begun", |replay| {
+        !replay["begin_timestamp_seconds"].is_null()
+    });
+    let begin = begun["begin_timestamp_seconds"].as_f64().unwrap();
+    let go = |seconds: f64| {
+        let to = begin + seconds;
+        change(
+            &agent,
+            &json!({"to_timestamp_seconds": to, "is_paused": true}),
+        );
+        change(&agent, &json!({"to_timestamp_seconds": to}));
+        let arrived = wait_for(&agent, "arrived", |replay| {
+            replay["is_jumping"] == false && replay["is_paused"] == true
+        });
+        assert!((time(&arrived) - to).abs() < 0.001, "{arrived} {to}");
+    };
+    go(4.0);
+    let at_four = counts(&agent);
+    go(2.0);
+    let at_two = counts(&agent);
+    assert_ne!(at_two, at_four);
+    // Events of the agent, such as its watches, are not of the capture.
+    let is_robot = |event: &String| event.starts_with("ros2.");
+    let names = || kept(&agent, "").into_iter().map(|event| event.event);
+    let robot_events = || names().filter(is_robot).collect::<Vec<_>>();
+    go(4.0);
+    assert_eq!(counts(&agent), at_four);
+    let events_at_four = robot_events();
+    assert!(!events_at_four.is_empty());
+    go(1.0);
+    assert!(robot_events().len() < events_at_four.len());
+    go(4.0);
+    assert_eq!(robot_events(), events_at_four);
+    change(&agent, &json!({"is_paused": false, "speed": 0}));
+    wait_for(&agent, "finished", |replay| replay["is_finished"] == true);
+    let at_end = counts(&agent);
+    go(2.0);
+    assert_eq!(counts(&agent), at_two);
+    change(&agent, &json!({"is_paused": false}));
+    wait_for(&agent, "finished again", |replay| {
+        replay["is_finished"] == true
+    });
+    assert_eq!(counts(&agent), at_end);
 }

@@ -200,6 +200,23 @@ fn replays_at_full_and_at_capture_speed_record_the_same_events() {
 }
 
 #[test]
+fn another_run_has_no_earlier_events_and_no_reader_misses_them() {
+    let log = EventLog::new();
+    log.add(taken((1..=3).map(node).collect()), second(0));
+    let (run, id) = (log.run(), log.id(3));
+    assert_eq!(log.position(&id), Some(Position::After(3)));
+    log.begin_run();
+    assert_ne!(log.run(), run);
+    assert_eq!(log.position(&id), Some(Position::Unknown));
+    // The second of the burst limit begins again, too.
+    log.add(taken(vec![node(1)]), second(0));
+    for after in [0, 2, 3] {
+        let batch = log.read(after, 10);
+        assert_eq!((batch.lagged, batch.records.len(), batch.last), (0, 1, 4));
+    }
+}
+
+#[test]
 fn overwritten_events_are_reported_to_the_reader_that_missed_them() {
     let log = EventLog::new();
     for number in 0..25 {
@@ -225,8 +242,9 @@ fn an_event_id_of_another_run_is_an_unknown_position() {
     let log = EventLog::new();
     log.add(taken(vec![node(1), node(2)]), second(0));
     assert_eq!(log.position(&log.id(1)), Some(Position::After(1)));
-    let mut before = EventLog::new();
-    before.run = Run(log.run.0 - 1);
+    let before = EventLog::new();
+    let Run(run) = log.number_of_run();
+    before.run.store(run - 1, Ordering::Release);
     before.add(taken(vec![node(1), node(2), node(3)]), second(0));
     assert_eq!(log.position(&before.id(1)), Some(Position::Unknown));
     assert_eq!(log.position(&log.id(3)), Some(Position::Unknown));

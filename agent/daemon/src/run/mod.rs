@@ -14,6 +14,7 @@ use ros2probe_wire::{GuidPrefix, Timestamp};
 use tokio_util::sync::CancellationToken;
 
 use self::causes::CauseDemand;
+use self::replay::ReplayError;
 use crate::agent_facts::AgentFacts;
 use crate::events::DropMonitor;
 use crate::events::EventLog;
@@ -25,7 +26,6 @@ use crate::subscriptions::Subscriptions;
 use crate::watches::Watches;
 pub use capture_time::CaptureTime;
 use ros2probe_capture::live::{CaptureError, LiveSource};
-use ros2probe_capture::pcap::PcapError;
 use ros2probe_capture::system::give_back_memory;
 use ros2probe_message::library::{DescribedFigures, Library};
 use ros2probe_metrics::otlp::{NodeLogSink, SpanSink};
@@ -56,6 +56,10 @@ const SUBSCRIBED_SLICE: Duration = Duration::from_millis(90);
 /// Maximum time for which readers wait for breakpoints in the processes that send to them.
 const ATTACH_TIMEOUT: Duration = Duration::from_secs(5);
 const CLOCK_INTERVAL: Duration = Duration::from_millis(100);
+/// Interval at which a replay at its end checks whether it has to go back.
+const END_POLL: Duration = Duration::from_millis(50);
+/// Reason for the end of subscriptions at the end of a replay.
+const END_OF_CAPTURE: &str = "end of capture";
 /// Minimum step back of the clock which means that the clock was set.
 const SET_BACK: Duration = Duration::from_secs(1);
 
@@ -65,9 +69,9 @@ pub enum RunError {
     /// Capturing on this host failed.
     #[error("the capture failed")]
     Capture(#[from] CaptureError),
-    /// The remaining part of a capture cannot be read; earlier packets are published.
+    /// The remaining part of a capture or bag cannot be read; earlier packets are published.
     #[error("the rest of the capture is unreadable")]
-    Replay(#[source] PcapError),
+    Replay(#[source] ReplayError),
 }
 
 /// Source, model and outputs of the working thread.
@@ -96,7 +100,11 @@ pub struct Run {
     stop: CancellationToken,
     state_writer: Option<StateWriter>,
     history: Option<History>,
+    restart: Option<Restart>,
 }
+
+/// Makes model and history as at the beginning, for a replay that goes back.
+pub type Restart = Box<dyn Fn() -> (Observer, Option<History>) + Send>;
 
 /// Outputs of the loop.
 #[derive(Debug)]
@@ -143,6 +151,7 @@ impl Run {
             stop,
             state_writer: None,
             history: None,
+            restart: None,
         }
     }
 
@@ -161,15 +170,25 @@ impl Run {
         Self { history, ..self }
     }
 
+    /// Lets a replay go back, also from its end: it then begins again, and goes on to the requested
+    /// time without waiting. Such a loop runs until it is stopped.
+    #[must_use]
+    pub fn with_restart(self, restart: Option<Restart>) -> Self {
+        Self { restart, ..self }
+    }
+
     /// Runs until it is stopped or the capture ends; the last snapshot stays published.
     ///
     /// # Errors
     ///
     /// Fails if the source fails permanently.
     pub fn run(mut self) -> Result<(), RunError> {
-        let ended = self.run_source();
+        let mut ended = self.run_source();
+        while ended.is_ok() && self.source.is_finished() && self.goes_back_later() {
+            ended = self.run_source();
+        }
         self.subscriptions.end(match &ended {
-            Ok(()) if self.source.is_finished() => "end of capture",
+            Ok(()) if self.source.is_finished() => END_OF_CAPTURE,
             Ok(()) => "agent ends",
             Err(_) => "the capture failed",
         });
@@ -262,10 +281,65 @@ impl Run {
     /// Makes a replay go on as clients request it, and returns what they request.
     fn apply_pace(&mut self) -> Pace {
         let pace = self.outputs.latest.replay_pace().get();
+        if self.has_passed(&pace) {
+            self.go_back();
+        }
         if let Source::Replay(replay) = &mut self.source {
             replay.follow(&pace);
         }
         pace
+    }
+
+    /// Waits at the end of a replay until it has to go back. Returns `false` if it is stopped, or
+    /// never goes back.
+    fn goes_back_later(&self) -> bool {
+        if self.restart.is_none() {
+            return false;
+        }
+        tracing::info!("the capture has ended; its final state remains");
+        self.subscriptions.end(END_OF_CAPTURE);
+        while !self.stop.is_cancelled() {
+            if self.has_passed(&self.outputs.latest.replay_pace().get()) {
+                return true;
+            }
+            std::thread::sleep(END_POLL);
+        }
+        false
+    }
+
+    /// Returns whether a replay that can go back has passed the time that clients request.
+    fn has_passed(&self, pace: &Pace) -> bool {
+        match (pace.jump, &self.source) {
+            (Some(Jump::To(time)), Source::Replay(replay)) => {
+                self.restart.is_some() && time < replay.clock()
+            }
+            _ => false,
+        }
+    }
+
+    /// Begins the replay again, with a model that knows nothing. If the file cannot be opened again,
+    /// the replay stays where it is.
+    fn go_back(&mut self) {
+        let (Source::Replay(replay), Some(restart)) = (&mut self.source, &self.restart) else {
+            return;
+        };
+        if let Err(error) = replay.begin_again() {
+            tracing::warn!(%error, "the replay cannot go back");
+            self.outputs
+                .latest
+                .replay_pace()
+                .change(|pace| pace.jump = None);
+            return;
+        }
+        (self.observer, self.history) = restart();
+        self.outputs.events.begin_run();
+        (self.published_until, self.complete_until) = <(Timestamp, Timestamp)>::default();
+        self.taken = None;
+        self.watches.begin_again();
+        self.subscriptions.begin_again();
+        self.take_watches();
+        // Clients of the new run never receive the state of the old one.
+        self.publish();
     }
 
     /// Ends the jump of a replay that has arrived. Returns whether it has.
@@ -274,6 +348,7 @@ impl Run {
             return false;
         };
         let has_arrived = match followed.jump {
+            // A request that came since then may lead back.
             Some(Jump::To(_)) => replay.has_reached_target(),
             Some(Jump::NextEvent) => has_event || replay.has_reached_target(),
             None => false,
@@ -348,6 +423,11 @@ impl Run {
             !matches!(class, Class::Participant | Class::Endpoint)
         });
         self.outputs.events.add(output.events, now);
+        if let Source::Replay(replay) = &mut self.source {
+            for definition in replay.take_definitions() {
+                self.outputs.library.add(definition, None);
+            }
+        }
         for source in output.type_sources {
             match source {
                 TypeSource::Description(response) => self.outputs.library.offer(response),

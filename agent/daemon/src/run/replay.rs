@@ -1,22 +1,33 @@
-//! Capture file as a source: delivers packets at the requested pace, in short slices so that the
-//! agent stays responsive.
+//! Capture file or bag as a source: delivers packets at the requested pace, in short slices so that
+//! the agent stays responsive.
+
+mod bag;
+mod player;
 
 use std::collections::BTreeMap;
 use std::io::IsTerminal as _;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::mpsc::{self, RecvTimeoutError};
 use std::time::{Duration, Instant};
 
+use ros2probe_bag::messages;
+use ros2probe_message::MessageType;
 use ros2probe_wire::frame::Link;
+use ros2probe_wire::walk::Envelope;
 use ros2probe_wire::{Expansion, Timestamp};
 use tokio::sync::watch;
 
+pub use self::bag::BagError;
+use self::bag::{BagReader, Due};
 use super::CaptureTime;
+use crate::recording::TriggeredBag;
 use crate::replay_pace::{Jump, Pace};
+use ros2probe_api::recordings::BagTrigger;
 use ros2probe_capture::frame_decoder::FrameDecoder;
 use ros2probe_capture::pcap::{Captured, Pacer, PcapError, PcapReader, Speed, link_name};
 use ros2probe_capture::reassembly::{Limits, Reassembly};
 use ros2probe_capture::streams::Streams;
+use ros2probe_model::observe::input::Input;
 use ros2probe_model::observe::observer::Observer;
 
 /// Interval of progress reports on a terminal.
@@ -86,9 +97,48 @@ impl ReplayControl {
     }
 }
 
-/// A capture in replay.
+/// Address of the messages of a bag: that of discovery, IPv4-mapped (RTPS 2.5, 9.6.2.4).
+const MULTICAST_ADDRESS: [u8; 16] = [0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0xff, 0xff, 239, 255, 0, 1];
+
+/// A capture or a bag cannot be replayed further.
+#[derive(Debug, thiserror::Error)]
+pub enum ReplayError {
+    /// The capture cannot be read.
+    #[error(transparent)]
+    Capture(#[from] PcapError),
+    /// The bag cannot be read.
+    #[error(transparent)]
+    Bag(#[from] BagError),
+}
+
+/// What is replayed.
+enum Packets {
+    Capture(PcapReader),
+    Bag(BagReader),
+}
+
+impl Packets {
+    /// Opens a capture or a bag.
+    fn open(path: &Path, expansion: Expansion) -> Result<Self, ReplayError> {
+        if messages::is_bag(path) {
+            return Ok(Self::Bag(BagReader::open(path, expansion)));
+        }
+        let reader = PcapReader::open(path, expansion)?;
+        if let Some(link) = reader.link().filter(|link| !link.is_supported()) {
+            return Err(PcapError::UnsupportedLink { link }.into());
+        }
+        Ok(Self::Capture(reader))
+    }
+}
+
+/// A capture or a bag in replay.
 pub struct Replay {
-    reader: PcapReader,
+    path: PathBuf,
+    expansion: Expansion,
+    limits: Limits,
+    /// What triggered the bag of a snapshot, and its time.
+    incident: Option<(Timestamp, BagTrigger)>,
+    packets_read: Packets,
     decoder: FrameDecoder,
     pacer: Pacer,
     /// Speed at the start, and now.
@@ -117,30 +167,45 @@ pub struct Replay {
 /// A packet that was read but is not due yet.
 struct Waiting {
     time: Timestamp,
-    link: Link,
-    interface: u32,
+    layer: Layer,
     bytes: Vec<u8>,
-    length: u32,
+}
+
+/// The layer at which the bytes of a packet begin.
+#[derive(Clone, Copy)]
+enum Layer {
+    /// A captured frame.
+    Frame {
+        link: Link,
+        interface: u32,
+        length: u32,
+    },
+    /// A datagram at this port, with a message of a bag.
+    Datagram { port: u16 },
 }
 
 impl Replay {
-    /// Opens a capture.
+    /// Opens a capture, or a bag in either storage of rosbag2.
     ///
     /// # Errors
     ///
-    /// Fails if the file cannot be read, is not a capture, or has an unsupported link layer.
+    /// Fails if the file cannot be read, is neither, or has an unsupported link layer.
     pub fn open(
         path: &Path,
         expansion: Expansion,
         speed: Speed,
         limits: Limits,
-    ) -> Result<Self, PcapError> {
-        let reader = PcapReader::open(path, expansion)?;
-        if let Some(link) = reader.link().filter(|link| !link.is_supported()) {
-            return Err(PcapError::UnsupportedLink { link });
-        }
+    ) -> Result<Self, ReplayError> {
         Ok(Self {
-            reader,
+            path: path.to_owned(),
+            expansion,
+            limits,
+            incident: TriggeredBag::read(path).and_then(|bag| {
+                let time: jiff::Timestamp = bag.trigger.time.parse().ok()?;
+                let time = u64::try_from(time.as_nanosecond()).ok()?;
+                Some((Timestamp(time), bag.trigger))
+            }),
+            packets_read: Packets::open(path, expansion)?,
             decoder: FrameDecoder::new(limits),
             pacer: Pacer::new(speed),
             started_speed: speed,
@@ -159,6 +224,22 @@ impl Replay {
             cut: false,
             finished: false,
         })
+    }
+
+    /// Begins again, at the speed of now.
+    ///
+    /// # Errors
+    ///
+    /// Fails if the file cannot be opened again. The replay then stays as it is.
+    pub(super) fn begin_again(&mut self) -> Result<(), ReplayError> {
+        self.packets_read = Packets::open(&self.path, self.expansion)?;
+        self.decoder = FrameDecoder::new(self.limits);
+        self.pacer = Pacer::new(self.speed);
+        (self.waiting, self.clock) = (None, self.began.unwrap_or_default());
+        (self.packets, self.bytes) = (0, 0);
+        self.unsupported.clear();
+        (self.cut, self.finished) = (false, false);
+        Ok(())
     }
 
     /// Makes the replay end at this time, as if the capture ended there.
@@ -211,6 +292,12 @@ impl Replay {
         self.finished || self.target.is_some_and(|target| self.clock >= target)
     }
 
+    /// Returns what triggered the bag of a snapshot, and its time.
+    #[must_use]
+    pub const fn incident(&self) -> Option<&(Timestamp, BagTrigger)> {
+        self.incident.as_ref()
+    }
+
     /// Returns the speed at the start.
     #[must_use]
     pub const fn started_speed(&self) -> Speed {
@@ -222,13 +309,13 @@ impl Replay {
     ///
     /// # Errors
     ///
-    /// Fails if the remaining capture cannot be read; earlier packets have been delivered.
+    /// Fails if the rest cannot be read; earlier packets have been delivered.
     pub fn poll(
         &mut self,
         timeout: Duration,
         until: Option<Timestamp>,
         observer: &mut Observer,
-    ) -> Result<(), PcapError> {
+    ) -> Result<(), ReplayError> {
         let end = Instant::now() + timeout;
         let until = until.into_iter().chain(self.target).min();
         if self.is_held && self.began.is_some() {
@@ -280,23 +367,8 @@ impl Replay {
                 if later.is_some() {
                     continue;
                 }
-                let Waiting {
-                    time,
-                    link,
-                    interface,
-                    length,
-                    ..
-                } = *waiting;
-                let bytes = &waiting.bytes;
-                self.clock = self.clock.max(time);
-                let captured = Captured {
-                    time,
-                    link,
-                    interface,
-                    bytes,
-                    length,
-                };
-                self.decoder.packet(&captured, observer);
+                self.clock = self.clock.max(waiting.time);
+                deliver(&mut self.decoder, waiting, self.clock, observer);
             }
             self.next()?;
         }
@@ -305,52 +377,45 @@ impl Replay {
     }
 
     /// Reads one packet ahead, into the memory of the previous one.
-    fn next(&mut self) -> Result<(), PcapError> {
+    fn next(&mut self) -> Result<(), ReplayError> {
         let memory = self.waiting.take().map(|waiting| waiting.bytes);
-        match self.reader.next_packet() {
-            Ok(Some(Captured {
-                time,
-                link,
-                interface,
-                bytes,
-                length,
-            })) => {
-                let mut memory = memory.unwrap_or_default();
-                memory.clear();
-                memory.extend_from_slice(bytes);
-                self.packets += 1;
-                self.bytes += bytes.len() as u64;
-                if !link.is_supported() {
-                    *self.unsupported.entry(link.0).or_default() += 1;
-                }
-                if self.began.is_none() {
-                    (self.began, self.clock) = (Some(time), time);
-                }
-                self.waiting = Some(Waiting {
-                    time,
-                    link,
-                    interface,
-                    bytes: memory,
-                    length,
-                });
-                Ok(())
-            }
-            Ok(None) => {
-                self.finished = true;
-                for (link, packets) in &self.unsupported {
-                    let link_type = link_name(Link(*link));
-                    tracing::warn!(
-                        link_type,
-                        packets,
-                        "packets of an unsupported link type skipped"
-                    );
-                }
-                self.is_readable()
-            }
-            Err(error) => {
-                self.finished = true;
-                Err(error)
-            }
+        let memory = memory.unwrap_or_default();
+        let next = match &mut self.packets_read {
+            Packets::Capture(reader) => next_frame(reader, memory).map_err(ReplayError::from),
+            Packets::Bag(reader) => next_message(reader, memory).map_err(ReplayError::from),
+        };
+        let waiting = next.inspect_err(|_| self.finished = true)?;
+        let Some(waiting) = waiting else {
+            self.finished = true;
+            self.report_skipped();
+            return Ok(self.is_readable()?);
+        };
+        self.packets += 1;
+        self.bytes += waiting.bytes.len() as u64;
+        if let Layer::Frame { link, .. } = waiting.layer
+            && !link.is_supported()
+        {
+            *self.unsupported.entry(link.0).or_default() += 1;
+        }
+        if self.began.is_none() {
+            (self.began, self.clock) = (Some(waiting.time), waiting.time);
+        }
+        self.waiting = Some(waiting);
+        Ok(())
+    }
+
+    /// Logs what was not replayed.
+    fn report_skipped(&self) {
+        for (link, packets) in &self.unsupported {
+            let link_type = link_name(Link(*link));
+            tracing::warn!(
+                link_type,
+                packets,
+                "packets of an unsupported link type skipped"
+            );
+        }
+        for fault in self.faults() {
+            tracing::warn!("{fault}");
         }
     }
 
@@ -441,7 +506,28 @@ impl Replay {
         if self.finished {
             return Some(1.0);
         }
-        self.reader.part_read()
+        match &self.packets_read {
+            Packets::Capture(reader) => reader.part_read(),
+            Packets::Bag(reader) => reader.part_read(),
+        }
+    }
+
+    /// Returns the parts of a bag that were not replayed, as lines for people. They are complete at
+    /// the end.
+    #[must_use]
+    pub fn faults(&self) -> Vec<String> {
+        match &self.packets_read {
+            Packets::Capture(_) => Vec::new(),
+            Packets::Bag(reader) => reader.faults(),
+        }
+    }
+
+    /// Returns definitions of types in a bag that were not returned yet.
+    pub(super) fn take_definitions(&mut self) -> Vec<MessageType> {
+        match &mut self.packets_read {
+            Packets::Capture(_) => Vec::new(),
+            Packets::Bag(reader) => reader.take_definitions(),
+        }
     }
 
     /// Returns the number of packets and of their bytes so far.
@@ -477,10 +563,82 @@ impl Replay {
             self.progress = Some(Instant::now());
             let seconds =
                 self.clock.nanoseconds_since(self.began.unwrap_or_default()) / 1_000_000_000;
+            let (packets, whole) = match self.packets_read {
+                Packets::Capture(_) => ("packets", "capture"),
+                Packets::Bag(_) => ("messages", "bag"),
+            };
             eprint!(
-                "\rreplayed {} packets, {seconds} s of the capture\x1b[K",
+                "\rreplayed {} {packets}, {seconds} s of the {whole}\x1b[K",
                 self.packets
             );
+        }
+    }
+}
+
+/// Reads a frame of a capture.
+fn next_frame(reader: &mut PcapReader, mut memory: Vec<u8>) -> Result<Option<Waiting>, PcapError> {
+    let Some(captured) = reader.next_packet()? else {
+        return Ok(None);
+    };
+    memory.clear();
+    memory.extend_from_slice(captured.bytes);
+    Ok(Some(Waiting {
+        time: captured.time,
+        layer: Layer::Frame {
+            link: captured.link,
+            interface: captured.interface,
+            length: captured.length,
+        },
+        bytes: memory,
+    }))
+}
+
+/// Reads a message of a bag.
+fn next_message(reader: &mut BagReader, memory: Vec<u8>) -> Result<Option<Waiting>, BagError> {
+    let due = reader.next(memory)?;
+    Ok(due.map(|Due { time, port, bytes }| Waiting {
+        time,
+        layer: Layer::Datagram { port },
+        bytes,
+    }))
+}
+
+/// Delivers a packet that is due at `clock`.
+fn deliver(
+    decoder: &mut FrameDecoder,
+    waiting: &Waiting,
+    clock: Timestamp,
+    observer: &mut Observer,
+) {
+    let Waiting { time, bytes, .. } = waiting;
+    match waiting.layer {
+        Layer::Frame {
+            link,
+            interface,
+            length,
+        } => {
+            let captured = Captured {
+                time: *time,
+                link,
+                interface,
+                bytes,
+                length,
+            };
+            decoder.packet(&captured, observer);
+        }
+        Layer::Datagram { port } => {
+            observer.input(Input::Time(clock));
+            let envelope = Envelope {
+                time: time.0,
+                destination: MULTICAST_ADDRESS,
+                destination_port: port,
+                ..Envelope::default()
+            };
+            observer.input(Input::Datagram {
+                envelope: &envelope,
+                payload: bytes,
+                handover: None,
+            });
         }
     }
 }

@@ -201,6 +201,8 @@ impl Source {
                     capture_begin: replay.began(),
                     replayed: replay.part_read(),
                     replay_speed: Some(replay.started_speed()),
+                    replay_faults: replay.faults(),
+                    replay_incident: replay.incident().map(|(_, trigger)| trigger.clone()),
                     unsupported_packets: replay
                         .unsupported()
                         .iter()

@@ -345,6 +345,14 @@ impl Subscriptions {
         }
     }
 
+    /// For the capture thread: a replay begins again. All requests count as changed, and new
+    /// subscriptions receive samples again.
+    pub fn begin_again(&self) {
+        let mut opened = self.lock_channels();
+        opened.ended = None;
+        self.change(self.channels.load().to_vec());
+    }
+
     fn sample(&self, channels: &[Arc<Channel>], to: &[u64], sample: &Arc<Sample>) {
         let mut arrival = None;
         let mut charge = None;

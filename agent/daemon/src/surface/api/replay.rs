@@ -46,9 +46,10 @@ async fn show(State(context): State<Context>) -> Result<Json<ReplayState>, Probl
     Ok(Json(view(&state, pace)))
 }
 
-/// Pause the replay, change its speed, or go to a later time
+/// Pause the replay, change its speed, or go to another time
 ///
-/// The change takes effect within a tenth of a second.
+/// The change takes effect within a tenth of a second. To go back, the replay begins again, and goes
+/// on to the time without waiting. All figures then begin again, too.
 #[utoipa::path(
     post,
     path = "/replay",
@@ -58,7 +59,7 @@ async fn show(State(context): State<Context>) -> Result<Json<ReplayState>, Probl
         (status = 200, description = "Position and new pace.", body = ReplayState),
         (status = 404, description = "The agent replays no capture.",
             body = ProblemBody, content_type = "application/problem+json"),
-        (status = 422, description = "The speed is out of range, or the time is before the position of the replay.",
+        (status = 422, description = "The speed is out of range, or the time is before the begin of the capture.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
 )]
@@ -67,7 +68,7 @@ async fn change(
     Body(request): Body<ReplayRequest>,
 ) -> Result<Json<ReplayState>, Problem> {
     let state = replayed(&context).await?;
-    let requested = requested(&request, state.known().time())?;
+    let requested = requested(&request, state.agent.capture_begin)?;
     let pace = context.latest.pace_replay(|pace| {
         pace.is_paused = request.is_paused.unwrap_or(pace.is_paused);
         pace.speed = requested.speed.or(pace.speed);
@@ -95,8 +96,8 @@ async fn replayed(context: &Context) -> Result<Arc<Known>, Problem> {
 /// Returns the requested speed and jump.
 ///
 /// # Errors
-/// Fails if the speed is impossible, or the time has passed.
-fn requested(request: &ReplayRequest, now: Timestamp) -> Result<Pace, Problem> {
+/// Fails if the speed is impossible, or the time is before the begin of the capture.
+fn requested(request: &ReplayRequest, begin: Option<Timestamp>) -> Result<Pace, Problem> {
     let invalid = |detail| Problem::new(Code::InvalidRequest, detail);
     let speed = match request.speed {
         None => None,
@@ -111,8 +112,12 @@ fn requested(request: &ReplayRequest, now: Timestamp) -> Result<Pace, Problem> {
             ));
         }
         Some(time) => match timestamp(time) {
-            Some(time) if time > now => Some(Jump::To(time)),
-            _ => return Err(invalid("the replay has passed `to_timestamp_seconds`")),
+            Some(time) if begin.is_some_and(|begin| time >= begin) => Some(Jump::To(time)),
+            _ => {
+                return Err(invalid(
+                    "`to_timestamp_seconds` is before the begin of the capture",
+                ));
+            }
         },
         None => request.to_next_event.then_some(Jump::NextEvent),
     };
@@ -141,7 +146,11 @@ fn view(state: &Known, pace: Pace) -> ReplayState {
         is_finished: agent.finished,
         is_paused: pace.is_paused(),
         speed: pace.times(agent.replay_speed),
-        is_jumping: pace.jump.is_some() && !agent.finished,
+        is_jumping: match pace.jump {
+            Some(Jump::To(time)) => !agent.finished || time < state.known().time(),
+            Some(Jump::NextEvent) => !agent.finished,
+            None => false,
+        },
     }
 }
 
@@ -150,12 +159,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn replay_requests_backwards_or_at_an_invalid_speed_are_refused() {
-        let now = Timestamp(100 * SECOND);
+    fn replay_requests_before_the_begin_or_at_an_invalid_speed_are_refused() {
+        let begin = Some(Timestamp(100 * SECOND));
         let of = |change: fn(&mut ReplayRequest)| {
             let mut request = ReplayRequest::default();
             change(&mut request);
-            requested(&request, now).map_err(|problem| problem.code())
+            requested(&request, begin).map_err(|problem| problem.code())
         };
         assert_eq!(of(|_| {}), Ok(Pace::default()));
         let speed = |speed| Pace {
@@ -170,7 +179,7 @@ mod tests {
             (|it| it.speed = Some(-1.0)) as fn(&mut ReplayRequest),
             |it| it.speed = Some(1000.1),
             |it| it.speed = Some(f64::NAN),
-            |it| it.to_timestamp_seconds = Some(100.0),
+            |it| it.to_timestamp_seconds = Some(99.9),
             |it| it.to_timestamp_seconds = Some(-1.0),
             |it| it.to_timestamp_seconds = Some(1e300),
             |it| (it.to_timestamp_seconds, it.to_next_event) = (Some(101.0), true),

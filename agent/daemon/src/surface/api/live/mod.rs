@@ -67,6 +67,8 @@ struct Stream {
     sent: Instant,
     /// Number of the last event that was processed.
     place: u64,
+    /// The run of the agent that was sent.
+    run: String,
     ended: bool,
     permit: Option<OwnedSemaphorePermit>,
 }
@@ -122,6 +124,7 @@ async fn live(
         last_sent_round: None,
         sent: Instant::now(),
         place: context.events.last(),
+        run: context.events.run(),
         ended: false,
         permit: Some(permit),
         context,
@@ -151,6 +154,7 @@ pub(super) fn initial_lines(context: &Context) -> Vec<u8> {
 fn open(context: &Context, state: &Known, access: String) -> Open {
     let replay = (state.agent.source == SourceKind::Replay).then(|| Replay {
         begin: state.agent.capture_begin.map(|begin| begin.seconds()),
+        incident: state.agent.replay_incident.clone(),
     });
     Open {
         run: context.events.run(),
@@ -210,9 +214,15 @@ impl Stream {
 
     fn batch(&mut self, lines: &mut Vec<u8>) {
         let context = &self.context;
+        let run = context.events.run();
+        if run != self.run {
+            // A replay went back. The page begins again, too.
+            (self.last_sent_round, self.run) = (None, run.clone());
+        }
         let (state, past) = (context.latest.state(), context.latest.past());
         let mut shared = context.live.shared();
         let shared = shared.get_or_insert_default();
+        shared.begin_run(run);
         shared.update(&state, &past, &context.watches.active());
         let seen = self.last_sent_round.unwrap_or(0);
         if self.last_sent_round.is_none() {

@@ -23,6 +23,8 @@ use ros2probe_model::report::snapshot::Snapshot;
 /// The lines of the current state, with the rounds of their last changes.
 #[derive(Debug, Default)]
 pub(super) struct SharedLines {
+    /// The run of the agent that they describe.
+    run: String,
     /// Number of the current round.
     round: u64,
     state: Option<Arc<State>>,
@@ -56,6 +58,16 @@ impl Part {
 }
 
 impl SharedLines {
+    /// Forgets all lines if they are of another run of the agent.
+    pub(super) fn begin_run(&mut self, run: String) {
+        if self.run != run {
+            *self = Self {
+                run,
+                ..Self::default()
+            };
+        }
+    }
+
     /// Updates the lines to a new state; does nothing if the state is the current one.
     pub(super) fn update(
         &mut self,

@@ -1,0 +1,211 @@
+//! Bags as a source: every command that reads a capture reads a bag, and prints the same of it.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use ros2probe_testing::local_agent::{LocalAgent, PATIENCE, call_api};
+use ros2probe_testing::repository;
+use serde_json::{Value, json};
+
+use crate::bag_chains::{CAPTURE, converted, recorded, sqlite3};
+use crate::page::get;
+use crate::ros2::{run, stderr, stdout};
+use crate::rp;
+
+/// A bag that Humble recorded.
+const REAL: &str = "agent/testing/data/bags/bag_zstd_fast";
+
+fn of(path: &Path, arguments: &[&str]) -> String {
+    let replay = ["--replay", path.to_str().unwrap()];
+    let output = run(&[arguments, &replay].concat());
+    assert!(output.status.success(), "{arguments:?} {}", stderr(&output));
+    stdout(&output)
+}
+
+/// Copies a bag's files into a directory of this name.
+fn copy(bag: &Path, into: &Path) -> PathBuf {
+    fs::create_dir(into).unwrap();
+    for entry in fs::read_dir(bag).unwrap() {
+        let from = entry.unwrap().path();
+        fs::copy(&from, into.join(from.file_name().unwrap())).unwrap();
+    }
+    into.to_owned()
+}
+
+#[test]
+fn a_bag_and_the_capture_that_it_was_made_of_print_the_same() {
+    let directory = tempfile::tempdir().unwrap();
+    let capture = repository(CAPTURE);
+    let bag = converted(directory.path());
+    let messages = recorded(&bag);
+    let topics: BTreeSet<&str> = messages.iter().map(|one| one.topic.as_str()).collect();
+    assert!(topics.len() >= 4, "{topics:?}");
+    for topic in topics {
+        for command in ["echo", "hz", "bw"] {
+            let arguments = ["topic", command, topic];
+            assert_eq!(
+                of(&bag, &arguments),
+                of(&capture, &arguments),
+                "{arguments:?}"
+            );
+        }
+        let types = of(&bag, &["topic", "type", topic]);
+        assert_eq!(types, of(&capture, &["topic", "type", topic]));
+    }
+}
+
+#[test]
+fn both_storages_of_a_bag_print_the_same() {
+    let directory = tempfile::tempdir().unwrap();
+    let bag = converted(directory.path());
+    let mut messages = recorded(&bag);
+    // A message in many pages of the sqlite3 file.
+    let last = messages.last().unwrap().log_time;
+    let mut large = messages[0].clone();
+    (large.topic, large.type_name) = ("/large".to_owned(), "std_msgs/msg/String".to_owned());
+    large.log_time = last + 1;
+    large.data = b"\0\x01\0\0".to_vec();
+    large.data.extend_from_slice(&300_001_u32.to_le_bytes());
+    large.data.extend_from_slice(&b"x".repeat(300_000));
+    large.data.push(0);
+    messages.push(large);
+    let lite = sqlite3(directory.path(), &messages);
+    let text = of(&lite, &["topic", "echo", "/large", "--full-length"]);
+    assert_eq!(
+        text.trim_end().len(),
+        "data: ".len() + 300_000 + "\n---".len()
+    );
+    let topic = messages[0].topic.as_str();
+    for command in ["echo", "hz"] {
+        let arguments = ["topic", command, topic];
+        assert_eq!(of(&lite, &arguments), of(&bag, &arguments), "{arguments:?}");
+    }
+}
+
+#[test]
+fn topics_of_a_bag_are_published_by_the_player_with_the_recorded_qos() {
+    let bag = repository(REAL);
+    assert_eq!(of(&bag, &["node", "list"]), "/rosbag2_player\n");
+    assert_eq!(
+        of(&bag, &["topic", "list", "-t"]),
+        "/chatter [std_msgs/msg/String]\n/robot1/imu/data [sensor_msgs/msg/Imu]\n\
+         /tf_static [tf2_msgs/msg/TFMessage]\n"
+    );
+    let info = of(&bag, &["topic", "info", "-v", "/robot1/imu/data"]);
+    for line in [
+        "Publisher count: 1",
+        "Node name: rosbag2_player",
+        "  Reliability: BEST_EFFORT",
+        "  History (Depth): KEEP_LAST (5)",
+        "  Durability: VOLATILE",
+        "Subscription count: 0",
+    ] {
+        assert!(info.contains(line), "{line}: {info}");
+    }
+    let tree = of(&bag, &["tf"]);
+    assert!(tree.contains("lidar_link  static"), "{tree}");
+    // Its file, without metadata.yaml.
+    let file = bag.join("bag_zstd_fast_0.mcap");
+    assert_eq!(
+        of(&file, &["topic", "list", "-t"]),
+        of(&bag, &["topic", "list", "-t"])
+    );
+    assert_eq!(
+        of(&file, &["topic", "info", "-v", "/robot1/imu/data"]),
+        info
+    );
+}
+
+#[test]
+fn a_damaged_bag_is_replayed_as_far_as_possible_and_says_so() {
+    let directory = tempfile::tempdir().unwrap();
+    let whole = fs::read(converted(directory.path()).join("drive_0.mcap")).unwrap();
+    let cut = directory.path().join("cut.mcap");
+    fs::write(&cut, &whole[..whole.len() / 2]).unwrap();
+    let replay = ["--replay", cut.to_str().unwrap()];
+    let output = run(&[&["topic", "list"][..], &replay].concat());
+    assert!(stdout(&output).lines().count() >= 3, "{}", stdout(&output));
+    let said = stderr(&output);
+    assert!(said.contains("was not completed"), "{said}");
+    assert_eq!(said.lines().count(), 1, "{said}");
+
+    for (path, reason) in [
+        (directory.path().join("nothing"), "cannot open capture"),
+        (directory.path().join("empty"), "holds no file of a bag"),
+        (repository("Cargo.toml"), "not a capture"),
+    ] {
+        if path.ends_with("empty") {
+            fs::create_dir(&path).unwrap();
+        }
+        let output = run(&["topic", "list", "--replay", path.to_str().unwrap()]);
+        assert_eq!(output.status.code(), Some(1), "{}", path.display());
+        let said = stderr(&output);
+        assert!(said.contains(reason), "{said}");
+        assert_eq!(said.lines().count(), 1, "{said}");
+    }
+}
+
+#[test]
+fn messages_that_are_not_cdr_are_skipped_and_counted() {
+    let directory = tempfile::tempdir().unwrap();
+    let mut messages = recorded(&converted(directory.path()));
+    messages.truncate(20);
+    for (index, message) in messages.iter_mut().enumerate() {
+        match index % 4 {
+            0 => message.data = b"{}".to_vec(),
+            1 => message.topic = "no/slash".to_owned(),
+            _ => {}
+        }
+    }
+    let lite = sqlite3(directory.path(), &messages);
+    let output = run(&["topic", "list", "--replay", lite.to_str().unwrap()]);
+    let said = stderr(&output);
+    assert!(said.contains("10 messages skipped"), "{said}");
+}
+
+/// Returns the replay once it is as wanted.
+fn wait_for(agent: &LocalAgent, is_wanted: impl Fn(&Value) -> bool) -> Value {
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        let replay = get(agent, "/replay");
+        if is_wanted(&replay) {
+            return replay;
+        }
+        assert!(Instant::now() < deadline, "{replay}");
+        std::thread::sleep(Duration::from_millis(50));
+    }
+}
+
+#[test]
+fn the_bag_of_an_incident_pauses_at_its_trigger() {
+    let directory = tempfile::tempdir().unwrap();
+    let bag = copy(&repository(REAL), &directory.path().join("incident"));
+    let trigger = json!({
+        "snapshot": "last", "trigger": "message_lost", "event": "ros2.message.lost",
+        "time": "2026-11-20T02:39:08.500000000Z", "attributes": {"topic": "/chatter", "domain_id": 0},
+    });
+    let file = bag.join("metadata.yaml");
+    let text = fs::read_to_string(&file).unwrap();
+    assert!(!text.contains("custom_data"), "{text}");
+    let trigger = trigger.to_string().replace('"', "\\\"");
+    fs::write(
+        &file,
+        format!(
+            "{}\n  custom_data:\n    ros2probe_trigger: \"{trigger}\"\n",
+            text.trim_end()
+        ),
+    )
+    .unwrap();
+    let agent = LocalAgent::replay(&mut rp(), &bag, &["--watch", "/**"]);
+    let paused = wait_for(&agent, |replay| {
+        replay["is_paused"] == true && replay["is_jumping"] == false
+    });
+    let at = paused["timestamp_seconds"].as_f64().unwrap();
+    assert!((at - 1_795_142_348.5).abs() < 0.001, "{paused}");
+    let change = json!({"is_paused": false, "speed": 0}).to_string();
+    let (status, _) = call_api(agent.api, "POST", "/replay", &change);
+    assert_eq!(status, 200);
+    wait_for(&agent, |replay| replay["is_finished"] == true);
+}
