@@ -7,8 +7,9 @@ use clap::Args;
 use ros2probe::client::{Agent, Target};
 use ros2probe::ros2::Refused;
 use ros2probe::ros2::echo::{self, Echo};
-use ros2probe::ros2::name::full_name;
+use ros2probe::ros2::name::{full_name, full_type};
 use ros2probe_daemon::escape::visible_lines;
+use ros2probe_message::Kind;
 
 use super::follow::{Printing, StreamItem, StreamStatus, Types, follow, for_stdout, topic};
 use super::notes::{NOT_ALL_PRINTED, Notes};
@@ -84,7 +85,10 @@ impl ServiceEcho {
                 ))?;
             }
         }
-        let expected = self.service_type.map(|name| format!("{name}_Event"));
+        let expected = self.service_type.map(|typed| {
+            let service_type = full_type(&typed, Kind::Service);
+            format!("{service_type}_Event")
+        });
         let topics = [(None, events)];
         print(
             &agent,
@@ -104,6 +108,7 @@ impl ActionEcho {
         let domain_id = self.target.domain()?;
         if let Some(action_type) = &self.action_type {
             let types = Types::new(self.printing.library(&self.target));
+            let action_type = full_type(action_type, Kind::Action);
             types.find(&format!("{action_type}_FeedbackMessage"), None)?;
         }
         let agent = Agent::reach_stream(&self.target)?;

@@ -155,10 +155,7 @@ fn a_topic_that_cannot_be_echoed_is_reported_in_one_line() {
         &ask(&["--filter", "m.x > 1"]),
         "'Imu' object has no attribute 'x'",
     );
-    fails_with(
-        &ask(&["sensor_msgs/Imu"]),
-        "The passed message type is invalid",
-    );
+    fails_with(&ask(&["Imu"]), "The passed message type is invalid");
     fails_with(
         &ask(&["no_msgs/msg/None"]),
         "no definition of no_msgs/msg/None",
@@ -176,6 +173,45 @@ fn a_topic_that_cannot_be_echoed_is_reported_in_one_line() {
         "{}",
         stderr(&other)
     );
+}
+
+/// Service events are not in this capture: only the type is checked.
+#[test]
+fn a_type_without_its_kind_is_that_of_the_command() {
+    let once = ["topic", "echo", IMU, "--once"];
+    let full = echo(&[&once[..], &["sensor_msgs/msg/Imu"]].concat(), START, END);
+    let short = echo(&[&once[..], &["sensor_msgs/Imu"]].concat(), START, END);
+    assert!(stdout(&full).starts_with("header:\n"), "{}", stderr(&full));
+    assert_eq!(short, full);
+
+    let capture = Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("../testing/data/cyclonedds/lifecycle-2ns/capture.pcap.gz");
+    let replay = ["--csv", "--replay", capture.to_str().unwrap()];
+    for (command, name, package, kind, type_name) in [
+        (
+            "action",
+            "fibonacci",
+            "example_interfaces",
+            "action",
+            "Fibonacci",
+        ),
+        (
+            "service",
+            "add_two_ints",
+            "example_interfaces",
+            "srv",
+            "AddTwoInts",
+        ),
+    ] {
+        let name = format!("/robot1/{name}");
+        let ask = |type_name: &str| {
+            let words = [command, "echo", &name, type_name];
+            run(&[&words[..], &replay].concat())
+        };
+        let full = ask(&format!("{package}/{kind}/{type_name}"));
+        assert_eq!(full.status.code(), Some(0), "{}", stderr(&full));
+        assert_eq!(ask(&format!("{package}/{type_name}")), full, "{command}");
+    }
 }
 
 #[test]
