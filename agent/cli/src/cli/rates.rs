@@ -185,8 +185,12 @@ fn measure(
     let is_replay = target.replay.is_some();
     let notes = Notes::begin(&agent, domain_id, is_replay, &names, sampled(quantity));
     rates.sampled_reported(notes.sampled());
-    let payload = sieve.is_some();
-    let path = format!("/samples?{query}&domain_id={domain_id}&payload={payload}");
+    // As in ros2cli, the subscription is volatile: a message that was sent before does not count.
+    let payload = match sieve {
+        Some(_) => "&payload=true&latched=false",
+        None => "",
+    };
+    let path = format!("/samples?{query}&domain_id={domain_id}{payload}");
     let mut lines = agent.stream(&path)?;
     let mut output = Output::new();
     let mut measurement = Measurement {
