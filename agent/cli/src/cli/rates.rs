@@ -183,7 +183,8 @@ fn measure(
         .collect();
     let agent = Agent::reach_stream(target)?;
     let is_replay = target.replay.is_some();
-    let notes = Notes::begin(&agent, domain_id, is_replay, &names, sampled(quantity));
+    let consequence = sampled(quantity, sieve.is_some());
+    let notes = Notes::begin(&agent, domain_id, is_replay, &names, consequence);
     rates.sampled_reported(notes.sampled());
     // As in ros2cli, the subscription is volatile: a message that was sent before does not count.
     let payload = match sieve {
@@ -255,11 +256,7 @@ impl Measurement<'_> {
                 Ok(())
             }
             Line::Missed(missed) => {
-                // Missing payloads do not change the counts of arrivals.
-                if matches!(
-                    missed.reason,
-                    MissedReason::QueueFull | MissedReason::Unannounced
-                ) {
+                if is_uncounted(missed.reason, self.sieve.is_some()) {
                     self.notes.missed(&missed);
                 }
                 Ok(())
@@ -281,7 +278,9 @@ impl Measurement<'_> {
     }
 
     fn sample(&mut self, sample: &Sample, payload: &Bytes) -> Result<Result<(), End>> {
-        self.notes.received(&sample.topic, false);
+        // Without a filter, `Rates` reports sampled topics.
+        let is_reported = sample.sampled && self.sieve.is_some();
+        self.notes.received(&sample.topic, is_reported);
         let arrival = Arrival {
             time: sample.time_ns,
             size: sample.size,
@@ -332,9 +331,21 @@ impl Topics {
     }
 }
 
+/// Returns whether messages that are missing for this reason are not counted. Without a filter,
+/// messages count without their payloads.
+const fn is_uncounted(reason: MissedReason, is_filtered: bool) -> bool {
+    match reason {
+        MissedReason::QueueFull | MissedReason::Unannounced => true,
+        MissedReason::NotCaptured => is_filtered,
+        // No subscriber received them.
+        MissedReason::Incomplete | MissedReason::Lost => false,
+    }
+}
+
 /// Returns the consequence of sampling for this quantity.
-const fn sampled(quantity: Quantity) -> &'static str {
+const fn sampled(quantity: Quantity, is_filtered: bool) -> &'static str {
     match quantity {
+        _ if is_filtered => "unseen messages are not counted",
         Quantity::Rate | Quantity::Bandwidth => {
             "unseen messages are counted from sequence numbers and their times estimated"
         }
@@ -364,4 +375,23 @@ fn unnamed(quantity: Quantity, dialect: Dialect) -> anyhow::Error {
 fn positive(text: &str) -> Result<usize, UserError> {
     let value = text.parse().ok().filter(|value| *value > 0);
     value.ok_or_else(|| UserError("value must be a positive integer".to_owned()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_message_without_its_payload_counts_only_without_a_filter() {
+        assert!(is_uncounted(MissedReason::NotCaptured, true));
+        assert!(!is_uncounted(MissedReason::NotCaptured, false));
+        for is_filtered in [true, false] {
+            assert!(is_uncounted(MissedReason::QueueFull, is_filtered));
+            assert!(!is_uncounted(MissedReason::Lost, is_filtered));
+        }
+        let counted = "unseen messages are counted from sequence numbers";
+        assert!(sampled(Quantity::Rate, false).starts_with(counted));
+        let filtered = sampled(Quantity::Rate, true);
+        assert_eq!(filtered, "unseen messages are not counted");
+    }
 }
