@@ -56,6 +56,8 @@ pub struct Rates {
     places: HashMap<String, usize>,
     /// Messages after the last tick of the clock, with the indices of their topics.
     waiting: Vec<(Arrival, usize)>,
+    /// Time up to which messages have been counted.
+    settled: i64,
     /// Sequence numbers of each writer.
     numbers: HashMap<String, Numbers>,
     /// Topics that were reported as sampled.
@@ -159,6 +161,7 @@ impl Rates {
             topics: Vec::new(),
             places: HashMap::new(),
             waiting: Vec::new(),
+            settled: i64::MIN,
             numbers: HashMap::new(),
             sampled_reported: HashSet::new(),
             next: None,
@@ -274,7 +277,7 @@ impl Rates {
             return Err(End::Refused(Refused("msg does not have header".to_owned())));
         }
         if self.waiting.len() >= MAX_WAITING {
-            self.settle(arrival.time);
+            self.settle(arrival.time.max(self.settled));
         }
         self.waiting.push((arrival, place));
         Ok(())
@@ -365,17 +368,20 @@ impl Rates {
         self.settle(i64::MAX);
     }
 
-    /// Counts the messages up to this time in the order of their times.
+    /// Counts the messages up to this time in the order of their times. An earlier time than that
+    /// of the last call means that the clock was set back.
     fn settle(&mut self, until: i64) {
+        self.settled = self.settled.min(until);
         self.waiting.sort_by_key(|(arrival, _)| arrival.time);
         let passed = self
             .waiting
             .partition_point(|(arrival, _)| arrival.time <= until);
         let later = self.waiting.split_off(passed);
         for (arrival, place) in mem::replace(&mut self.waiting, later) {
-            self.tick(arrival.time);
+            self.tick(arrival.time.max(self.settled));
             self.count(&arrival, place);
         }
+        self.settled = until;
     }
 
     fn count(&mut self, arrival: &Arrival, place: usize) {
@@ -386,7 +392,7 @@ impl Rates {
             .map(|watched| &mut watched.series)
         {
             Some(Series::Rate(intervals)) => {
-                intervals.add_message(arrival.time);
+                intervals.add_message(intervals.time_in_order(arrival.time, self.settled));
                 if reported_at_message && let Some(rate) = intervals.report_at_message() {
                     self.output.out.push_str(&rate.lines());
                 }
