@@ -183,6 +183,9 @@ fn measure(
         .collect();
     let agent = Agent::reach_stream(target)?;
     let is_replay = target.replay.is_some();
+    if !is_replay {
+        rates = rates.live();
+    }
     let consequence = sampled(quantity, sieve.is_some());
     let notes = Notes::begin(&agent, domain_id, is_replay, &names, consequence);
     rates.sampled_reported(notes.sampled());

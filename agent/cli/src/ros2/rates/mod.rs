@@ -28,9 +28,11 @@ const SECOND: i64 = 1_000_000_000;
 const NANOSECOND: f64 = 1e-9;
 /// Clears a terminal, as `--all` does before each table.
 const CLEAR_SCREEN: &str = "\x1b[H\x1b[2J\n";
-/// Maximum step of the clock. A larger step means that the clock was set, and skipped seconds are
-/// not reported.
+/// Maximum step of the clock of a capture, which may have gaps. A larger step means that the clock
+/// was set, and skipped seconds are not reported.
 const LONGEST_JUMP: i64 = 3600 * SECOND;
+/// Maximum step of the clock of a live agent, which ticks ten times a second.
+const LONGEST_LIVE_JUMP: i64 = 2 * SECOND;
 /// Maximum number of messages that wait for the clock, which ticks ten times a second.
 const MAX_WAITING: usize = 65_536;
 
@@ -64,6 +66,8 @@ pub struct Rates {
     sampled_reported: HashSet<String>,
     /// Time of the next periodic report.
     next: Option<i64>,
+    /// Maximum step of the clock.
+    longest_jump: i64,
     output: Output,
 }
 
@@ -152,6 +156,15 @@ impl Rates {
         Self::empty(quantity, dialect, window, true)
     }
 
+    /// Measures a live agent instead of a capture.
+    #[must_use]
+    pub fn live(self) -> Self {
+        Self {
+            longest_jump: LONGEST_LIVE_JUMP,
+            ..self
+        }
+    }
+
     fn empty(quantity: Quantity, dialect: Dialect, window: usize, all: bool) -> Self {
         Self {
             quantity,
@@ -165,6 +178,7 @@ impl Rates {
             numbers: HashMap::new(),
             sampled_reported: HashSet::new(),
             next: None,
+            longest_jump: LONGEST_JUMP,
             output: Output::default(),
         }
     }
@@ -419,7 +433,7 @@ impl Rates {
             }
             // The clock was set back or far ahead, so the seconds are counted from `now`.
             Some(next) if next.saturating_sub(now) > 2 * SECOND => now.saturating_add(SECOND),
-            Some(next) if now.saturating_sub(next) > LONGEST_JUMP => now,
+            Some(next) if now.saturating_sub(next) > self.longest_jump => now,
             Some(next) => next,
         };
         let mut due = next;

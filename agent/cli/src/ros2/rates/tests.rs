@@ -405,6 +405,20 @@ fn a_late_message_of_a_second_writer_causes_no_negative_interval() {
 }
 
 #[test]
+fn a_clock_step_of_minutes_causes_one_report_of_a_live_agent() {
+    let reports = |is_live: bool| {
+        let rates = Rates::of(Quantity::Bandwidth, Dialect::Humble, 100, named(&["/imu"]));
+        let mut rates = if is_live { rates.live() } else { rates };
+        rates.opened(&present(&[("/imu", IMU)])).unwrap();
+        rates.clock(at(0));
+        messages(&mut rates, "/imu", [100, 200]);
+        rates.clock(at(300_000));
+        rates.take().out.matches(" from 2 messages").count()
+    };
+    assert_eq!((reports(true), reports(false)), (1, 300));
+}
+
+#[test]
 fn a_clock_step_forward_causes_one_report_and_a_step_back_a_warning() {
     let mut rates = Rates::of(Quantity::Bandwidth, Dialect::Humble, 100, named(&["/imu"]));
     rates.opened(&present(&[("/imu", IMU)])).unwrap();
