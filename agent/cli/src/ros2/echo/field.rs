@@ -25,8 +25,10 @@ enum Step {
 pub(super) enum Selected<'a> {
     Message(&'a Message<'a>),
     Value(&'a Value<'a>),
-    /// An element of an array without a value of its own.
+    /// An element of a sequence, without a value of its own.
     Element(Value<'a>),
+    /// An element of a numpy array, which has the element's type.
+    NumpyElement(Value<'a>),
 }
 
 impl FromStr for FieldPath {
@@ -70,7 +72,10 @@ impl FieldPath {
                 (Selected::Value(Value::Array(array)), Step::Index(index)) => match &array.items {
                     Items::Scalars(scalars) => {
                         let element = scalars.get(*index).map(Value::Scalar);
-                        element.map(Selected::Element)
+                        element.map(|element| match array.is_fixed() {
+                            true => Selected::NumpyElement(element),
+                            false => Selected::Element(element),
+                        })
                     }
                     Items::Texts(texts) => {
                         let element = texts.get(*index).map(|text| Value::Text(text.clone()));
@@ -111,7 +116,7 @@ impl<'a> Selected<'a> {
         match self {
             Self::Message(message) => message.structure.name.name().to_owned(),
             Self::Value(value) => python::type_name(value).to_owned(),
-            Self::Element(value) => python::type_name(value).to_owned(),
+            Self::Element(value) | Self::NumpyElement(value) => python::type_name(value).to_owned(),
         }
     }
 }
