@@ -106,7 +106,7 @@ impl Echo {
         }
         let domain_id = self.target.domain()?;
         let agent = Agent::reach_stream(&self.target)?;
-        let types = Types::with_agent(self.printing.library(&self.target), &agent, domain_id);
+        let types = Types::new(self.printing.library(&self.target), &agent, domain_id);
         let mut output = Output::new();
 
         // A capture's topics are complete only after its end.

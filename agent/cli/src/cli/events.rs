@@ -106,15 +106,16 @@ impl ActionEcho {
         let parts = selected_parts(self.interfaces.as_deref()).map_err(user_error)?;
         let name = full_name(&self.action_name).map_err(user_error)?;
         let domain_id = self.target.domain()?;
-        if let Some(action_type) = &self.action_type {
-            let types = Types::new(self.printing.library(&self.target));
-            let action_type = full_type(action_type, Kind::Action);
-            types.find(&format!("{action_type}_FeedbackMessage"), None)?;
-        }
         let agent = Agent::reach_stream(&self.target)?;
+        let feedback = format!("{name}/_action/feedback");
+        if let Some(action_type) = &self.action_type {
+            let types = Types::new(self.printing.library(&self.target), &agent, domain_id);
+            let action_type = full_type(action_type, Kind::Action);
+            let expected = format!("{action_type}_FeedbackMessage");
+            find_definition(&types, &agent, domain_id, &feedback, &expected)?;
+        }
         if self.target.replay.is_none() && self.action_type.is_none() {
             let names = names_of(&agent, domain_id)?;
-            let feedback = format!("{name}/_action/feedback");
             if names.topics.iter().all(|topic| topic.name != feedback) {
                 let text = format!("Cannot find type for '{}'", self.action_name);
                 return Err(UserError(text).into());
@@ -127,6 +128,22 @@ impl ActionEcho {
         let output = Output::new();
         print(&agent, &self.target, &self.printing, &topics, None, output)
     }
+}
+
+/// Finds the definition of this type, which may be the one that the topic's first publisher
+/// announces. Fails without a definition.
+fn find_definition(
+    types: &Types<'_>,
+    agent: &Agent,
+    domain_id: u32,
+    name: &str,
+    expected: &str,
+) -> Result<()> {
+    let known = topic(agent, domain_id, name)?;
+    let publisher = known.as_ref().and_then(|known| known.publishers.first());
+    let hash = publisher.and_then(|publisher| publisher.definition_hash());
+    types.find_for(name, expected, hash)?;
+    Ok(())
 }
 
 /// Returns the parts that `--interfaces` selects. An unknown part fails with ros2cli's message.
@@ -160,9 +177,10 @@ fn print(
     expected: Option<&str>,
     mut output: Output,
 ) -> Result<ExitCode> {
-    let mut types = Types::new(printing.library(target));
-    if let Some(expected) = expected {
-        types.find(expected, None)?;
+    let domain_id = target.domain()?;
+    let mut types = Types::new(printing.library(target), agent, domain_id);
+    if let (Some(expected), [(_, name)]) = (expected, topics) {
+        find_definition(&types, agent, domain_id, name, expected)?;
     }
     let mut echo = Echo::new(echo::Options {
         dialect: target.dialect(),
@@ -172,7 +190,6 @@ fn print(
         ..echo::Options::default()
     });
     let names: Vec<_> = topics.iter().map(|(_, name)| name.clone()).collect();
-    let domain_id = target.domain()?;
     let is_replay = target.replay.is_some();
     let notes = Notes::begin(agent, domain_id, is_replay, &names, NOT_ALL_PRINTED);
     let mut notes = notes.of_parts();

@@ -14,8 +14,10 @@ use ros2probe::ros2::rates::{Arrival, End, Named, Origin, Quantity, Rates};
 use ros2probe::ros2::{Dialect, Refused};
 use ros2probe_api::path::encoded;
 use ros2probe_api::samples::{Line, MissedReason, Sample};
+use ros2probe_message::Library;
+use ros2probe_message::filter::Filter;
 
-use super::follow::{AGENT_ENDED, END_OF_CAPTURE, MessageFilter, library};
+use super::follow::{AGENT_ENDED, END_OF_CAPTURE, MessageFilter, Types, library};
 use super::interrupt::EXIT_INTERRUPTED;
 use super::notes::Notes;
 use super::shared::{Matching, Spinning, names_of};
@@ -93,18 +95,16 @@ struct Options {
 impl Hz {
     pub(crate) fn run(self, hidden: bool) -> Result<ExitCode> {
         let target = &self.options.target;
-        let library = || library(target, self.definitions);
-        let sieve = self
-            .filter
-            .map(|filter| MessageFilter::new(&filter, library()));
-        let sieve = sieve.transpose()?;
+        let filter = self.filter.as_deref().map(Filter::parse).transpose();
+        let filter = filter.map_err(|error| UserError(error.to_string()))?;
+        let filter = filter.map(|filter| (filter, library(target, self.definitions)));
         measure(
             Quantity::Rate,
             self.window,
             self.topics,
             target,
             hidden,
-            sieve,
+            filter,
         )
     }
 
@@ -160,7 +160,7 @@ fn measure(
     topics: Topics,
     target: &Target,
     hidden: bool,
-    sieve: Option<MessageFilter>,
+    filter: Option<(Filter, Library)>,
 ) -> Result<ExitCode> {
     let dialect = target.dialect();
     let domain_id = target.domain()?;
@@ -186,6 +186,10 @@ fn measure(
     if !is_replay {
         rates = rates.live();
     }
+    let sieve = filter.map(|(filter, library)| {
+        let types = Types::new(library, &agent, domain_id);
+        MessageFilter::new(filter, types)
+    });
     let consequence = sampled(quantity, sieve.is_some());
     let notes = Notes::begin(&agent, domain_id, is_replay, &names, consequence);
     rates.sampled_reported(notes.sampled());
@@ -236,7 +240,7 @@ struct Measurement<'a> {
     domain_id: u32,
     rates: Rates,
     notes: Notes<'a>,
-    sieve: Option<MessageFilter>,
+    sieve: Option<MessageFilter<'a>>,
     code: ExitCode,
 }
 

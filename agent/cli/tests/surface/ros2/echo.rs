@@ -387,6 +387,18 @@ fn a_type_without_an_installed_package_is_echoed_after_another_participant_reque
 }
 
 #[test]
+fn messages_of_a_type_that_only_the_agent_knows_are_filtered() {
+    let capture = Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("../testing/data/cyclonedds11/type-lookup.pcap.gz");
+    let capture = capture.to_str().unwrap();
+    let filter = ["--filter", "m.ok", "--replay", capture];
+    let measured = run(&[&["topic", "hz", "/things"][..], &filter].concat());
+    let text = stdout(&measured);
+    assert!(text.contains("average rate: 4.98"), "{text}");
+    assert_eq!(stderr(&measured), "", "{text}");
+}
+
+#[test]
 fn a_type_with_a_union_is_not_echoed() {
     let echoed = of_type_lookup("/odd", &[]);
     let text = stderr(&echoed);
