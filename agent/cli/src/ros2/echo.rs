@@ -107,6 +107,10 @@ impl Echo {
         payload: &[u8],
     ) -> Result<MessageText, Refused> {
         if self.options.raw {
+            let mut fields = self.options.fields.iter();
+            if let Some(refused) = fields.find_map(FieldPath::missing_in_bytes) {
+                return Err(refused);
+            }
             if !self.passes(Subject::Bytes(payload))? {
                 return Ok(MessageText::default());
             }

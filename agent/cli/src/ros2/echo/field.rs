@@ -62,6 +62,18 @@ impl FromStr for FieldPath {
 }
 
 impl FieldPath {
+    /// Returns the error for a field of a serialized message, which has no names. Returns `None` for
+    /// a path that begins with an index.
+    pub(super) fn missing_in_bytes(&self) -> Option<Refused> {
+        let Some(Step::Name(name)) = self.steps.first() else {
+            return None;
+        };
+        let text = &self.text;
+        Some(Refused(format!(
+            "Invalid field '{text}': 'bytes' object has no attribute '{name}'"
+        )))
+    }
+
     pub(super) fn select<'a>(&self, message: &'a Message<'a>) -> Result<Selected<'a>, Refused> {
         let mut found = Selected::Message(message);
         for step in &self.steps {

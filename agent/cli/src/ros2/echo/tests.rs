@@ -111,6 +111,12 @@ fn missing_fields_are_refused_with_the_text_of_ros2cli() {
         let refused = echo(fields(&[path])).unwrap_err();
         assert_eq!(refused.0, format!("Invalid field '{path}': {reason}"));
     }
+    let raw = Options {
+        raw: true,
+        ..fields(&["header.sec"])
+    };
+    let reason = "Invalid field 'header.sec': 'bytes' object has no attribute 'header'";
+    assert_eq!(echo(raw).unwrap_err().0, reason);
     for path in ["", ".", "..", "a[", "a[x]", "a[0"] {
         let refused = path.parse::<FieldPath>().unwrap_err();
         assert_eq!(refused.0, format!("Invalid field value '{path}'"));
