@@ -9,7 +9,7 @@ use ros2probe::ros2::Refused;
 use ros2probe::ros2::echo::{self, Echo};
 use ros2probe::ros2::name::{full_name, full_type};
 use ros2probe_daemon::escape::visible_lines;
-use ros2probe_message::Kind;
+use ros2probe_message::{Kind, TypeName};
 
 use super::follow::{Printing, StreamItem, StreamStatus, Types, follow, for_stdout, topic};
 use super::notes::{NOT_ALL_PRINTED, Notes};
@@ -65,6 +65,9 @@ impl ServiceEcho {
     pub(crate) fn run(self) -> Result<ExitCode> {
         let name = full_name(&self.service_name).map_err(user_error)?;
         let events = format!("{name}/_service_event");
+        let typed = self.service_type.as_deref();
+        let service_type = typed.map(|typed| checked_type(typed, Kind::Service));
+        let service_type = service_type.transpose()?;
         let domain_id = self.target.domain()?;
         let agent = Agent::reach_stream(&self.target)?;
         let mut output = Output::new();
@@ -85,10 +88,7 @@ impl ServiceEcho {
                 ))?;
             }
         }
-        let expected = self.service_type.map(|typed| {
-            let service_type = full_type(&typed, Kind::Service);
-            format!("{service_type}_Event")
-        });
+        let expected = service_type.map(|name| format!("{name}_Event"));
         let topics = [(None, events)];
         print(
             &agent,
@@ -105,12 +105,14 @@ impl ActionEcho {
     pub(crate) fn run(self) -> Result<ExitCode> {
         let parts = selected_parts(self.interfaces.as_deref()).map_err(user_error)?;
         let name = full_name(&self.action_name).map_err(user_error)?;
+        let typed = self.action_type.as_deref();
+        let action_type = typed.map(|typed| checked_type(typed, Kind::Action));
+        let action_type = action_type.transpose()?;
         let domain_id = self.target.domain()?;
         let agent = Agent::reach_stream(&self.target)?;
         let feedback = format!("{name}/_action/feedback");
-        if let Some(action_type) = &self.action_type {
+        if let Some(action_type) = &action_type {
             let types = Types::new(self.printing.library(&self.target), &agent, domain_id);
-            let action_type = full_type(action_type, Kind::Action);
             let expected = format!("{action_type}_FeedbackMessage");
             find_definition(&types, &agent, domain_id, &feedback, &expected)?;
         }
@@ -128,6 +130,18 @@ impl ActionEcho {
         let output = Output::new();
         print(&agent, &self.target, &self.printing, &topics, None, output)
     }
+}
+
+/// Returns the full name of a type on the command line. Fails with ros2cli's message, which is the
+/// same for a service and an action.
+fn checked_type(typed: &str, kind: Kind) -> Result<String> {
+    let name = full_type(typed, kind);
+    let known: Result<TypeName, _> = name.parse();
+    if known.is_ok_and(|known| known.kind() == kind) {
+        return Ok(name);
+    }
+    let text = format!("The service type '{typed}' is invalid");
+    Err(UserError(text).into())
 }
 
 /// Finds the definition of this type, which may be the one that the topic's first publisher

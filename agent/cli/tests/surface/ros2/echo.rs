@@ -215,6 +215,27 @@ fn a_type_without_its_kind_is_that_of_the_command() {
 }
 
 #[test]
+fn a_type_that_is_no_service_or_action_is_refused() {
+    for (command, type_name) in [
+        ("service", "AddTwoInts"),
+        ("service", "std_msgs/msg/String"),
+        ("action", "example_interfaces/"),
+        ("action", "example_interfaces/srv/AddTwoInts"),
+    ] {
+        let output = run(&[
+            command,
+            "echo",
+            "/a",
+            type_name,
+            "--replay",
+            "/nowhere.pcap",
+        ]);
+        let reason = format!("The service type '{type_name}' is invalid");
+        fails_with(&output, &reason);
+    }
+}
+
+#[test]
 fn only_messages_that_match_the_filter_are_measured() {
     let hz = |further: &[&str]| {
         let output = echo(&[&["topic", "hz", IMU], further].concat(), START, END);
