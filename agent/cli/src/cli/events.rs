@@ -1,5 +1,6 @@
 //! `rp service echo` and `rp action echo`: print service events and the parts of actions.
 
+use std::borrow::Cow;
 use std::process::ExitCode;
 
 use anyhow::Result;
@@ -75,16 +76,16 @@ impl ServiceEcho {
         if self.target.replay.is_none() {
             if self.service_type.is_none() {
                 let names = names_of(&agent, domain_id)?;
-                if names.services.iter().all(|service| service.name != name) {
-                    let text = format!("Cannot find type for '{}'", self.service_name);
-                    return Err(UserError(text).into());
-                }
+                let types = names.services.iter().find(|service| service.name == name);
+                let types = types.map(|service| service.types.as_slice());
+                check_single_type(&self.service_name, types).map_err(user_error)?;
             }
             let known = topic(&agent, domain_id, &events)?;
             if known.is_none_or(|known| known.publishers.is_empty()) {
+                let typed = &self.service_name;
                 output.write(&format!(
-                    "No publishers on topic '{events}'; is service introspection on the client or \
-                     server enabled?\n"
+                    "No publishers on topic '{typed}/_service_event'; is service introspection on \
+                     the client or server enabled?\n"
                 ))?;
             }
         }
@@ -142,6 +143,18 @@ fn checked_type(typed: &str, kind: Kind) -> Result<String> {
     }
     let text = format!("The service type '{typed}' is invalid");
     Err(UserError(text).into())
+}
+
+/// Checks that the service has one type. Fails with ros2cli's message otherwise.
+fn check_single_type(typed: &str, types: Option<&[Cow<'_, str>]>) -> Result<(), Refused> {
+    match types {
+        None => Err(Refused(format!("Cannot find type for '{typed}'"))),
+        Some([_, _, ..]) => {
+            let text = format!("More than one type associated with service '{typed}'");
+            Err(Refused(text))
+        }
+        Some(_) => Ok(()),
+    }
 }
 
 /// Finds the definition of this type, which may be the one that the topic's first publisher

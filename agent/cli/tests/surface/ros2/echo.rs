@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use ros2probe_message::MessageType;
+use ros2probe_testing::local_agent::LocalAgent;
 use ros2probe_testing::model::capture::{Capture, ETHERNET};
 use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS};
 use ros2probe_testing::type_description::{Response, described, field};
@@ -10,6 +11,7 @@ use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 use serde::Deserialize;
 
 use super::{fails_with, run, stderr, stdout};
+use crate::rp;
 
 #[derive(Deserialize)]
 struct Recorded {
@@ -233,6 +235,28 @@ fn a_type_that_is_no_service_or_action_is_refused() {
         let reason = format!("The service type '{type_name}' is invalid");
         fails_with(&output, &reason);
     }
+}
+
+#[test]
+fn a_service_of_two_types_is_echoed_only_with_its_type() {
+    let capture = super::graph::own().join("mixed.pcap.gz");
+    let mut agent = LocalAgent::replay(&mut rp(), &capture, &["--speed", "max"]);
+    agent.wait_for_log("the capture has ended");
+    let host = agent.api.to_string();
+    let ask = |words: &[&str]| {
+        let command = ["service", "echo", "--host", &host];
+        run(&[&command[..], words].concat())
+    };
+    fails_with(
+        &ask(&["/mixed/serve"]),
+        "More than one type associated with service '/mixed/serve'",
+    );
+    fails_with(&ask(&["/nope"]), "Cannot find type for '/nope'");
+    // The name is printed as it was typed.
+    let silent = ask(&["mixed/serve", "std_srvs/srv/Trigger"]);
+    let begin = "No publishers on topic 'mixed/serve/_service_event'; is service introspection";
+    let printed = stdout(&silent);
+    assert!(printed.starts_with(begin), "{printed}{}", stderr(&silent));
 }
 
 #[test]
