@@ -81,7 +81,7 @@ fn fields_print_as_yaml_or_as_python() {
 fn an_element_of_a_numpy_array_prints_as_few_digits_as_its_type_has() {
     let schema = "float32[2] q\nfloat32[] r\nint8[1] n\n";
     let message_type = MessageType::parse(&"a/msg/B".parse().unwrap(), schema).unwrap();
-    let mut payload = vec![0, 1, 0, 0];
+    let mut payload: Vec<u8> = vec![0, 1, 0, 0];
     payload.extend([0.5_f32, 0.1].map(f32::to_le_bytes).concat());
     payload.extend([1, 0, 0, 0]);
     payload.extend(0.1_f32.to_le_bytes());

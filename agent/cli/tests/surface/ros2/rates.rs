@@ -146,7 +146,7 @@ fn a_latched_message_that_was_sent_before_does_not_count() {
     let mut capture = Capture::new(ETHERNET);
     capture.participant(START, 0, participant);
     let transient_local = 1_u32.to_le_bytes();
-    let reliable = [2, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0];
+    let reliable = [2_u8, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0];
     let qos = [(0x1d, &transient_local[..]), (0x1a, &reliable[..])];
     let announced = "std_msgs::msg::dds_::String_";
     let payload = forge::endpoint_with(talker, "rt/chatter", announced, &qos);
