@@ -199,8 +199,8 @@ pub(crate) struct Types<'a> {
 }
 
 impl<'a> Types<'a> {
-    /// Returns definitions of the library and of the agent. The agent has those that nodes described,
-    /// and may have other packages installed.
+    /// Returns definitions of the library and of the agent. The agent has those that nodes
+    /// described, and may have other packages installed.
     pub(crate) fn new(library: Library, agent: &'a Agent, domain_id: u32) -> Self {
         Self {
             library,

@@ -137,8 +137,8 @@ fn note(answer: &Parameters<'_>) {
     }
 }
 
-/// Returns the changes after the last printed one. The list is in the order of time, and old changes
-/// leave it at its beginning.
+/// Returns the changes after the last printed one. The list is in the order of time, and old
+/// changes leave it at its beginning.
 fn unprinted<'a>(
     changes: &'a [ParameterChange<'static>],
     last: Option<&ParameterChange<'static>>,

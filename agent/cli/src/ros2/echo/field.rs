@@ -62,8 +62,8 @@ impl FromStr for FieldPath {
 }
 
 impl FieldPath {
-    /// Returns the error for a field of a serialized message, which has no names. Returns `None` for
-    /// a path that begins with an index.
+    /// Returns the error for a field of a serialized message, which has no names. Returns `None`
+    /// for a path that begins with an index.
     pub(super) fn missing_in_bytes(&self) -> Option<Refused> {
         let Some(Step::Name(name)) = self.steps.first() else {
             return None;

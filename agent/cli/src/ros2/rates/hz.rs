@@ -41,9 +41,9 @@ impl Intervals {
         }
     }
 
-    /// Returns the time at which a message counts if messages up to `settled` were counted. A message
-    /// in shared memory may be seen after a later one of another writer: it then counts at the time
-    /// of that one. If the newest message is later than `settled`, the clock was set back.
+    /// Returns the time at which a message counts if messages up to `settled` were counted. A
+    /// message in shared memory may be seen after a later one of another writer: it then counts at
+    /// the time of that one. If the newest message is later than `settled`, the clock was set back.
     #[must_use]
     pub fn time_in_order(&self, time: i64, settled: i64) -> i64 {
         if self.first.is_some() && self.newest <= settled {
