@@ -44,8 +44,11 @@ pub struct Parameter<'a> {
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct ParameterChange<'a> {
-    /// Unix time of the event.
+    /// Unix time of the event. It changes if the wall clock is set.
     pub timestamp_seconds: f64,
+    /// Time of the event in nanoseconds of the agent's monotonic clock, which identifies the
+    /// change. Its beginning is arbitrary.
+    pub monotonic_ns: u64,
     /// Domain id.
     pub domain_id: u32,
     /// Fully qualified name of the node.

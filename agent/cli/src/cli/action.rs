@@ -6,10 +6,12 @@ use std::process::ExitCode;
 use anyhow::Result;
 use clap::{Args, Subcommand};
 use ros2probe::client::Target;
+use ros2probe::ros2::name::full_name;
 use ros2probe::ros2::{action, topic};
 use ros2probe_api::names::Names;
 use ros2probe_api::nodes::Named;
 
+use super::UserError;
 use super::events::ActionEcho;
 use super::shared::{Graph, print_names, print_or_fail, print_text};
 
@@ -102,9 +104,10 @@ impl List {
 
 impl Info {
     fn ask(self) -> Result<ExitCode> {
-        let name = &self.action_name;
-        let feedback = Graph::reach(&self.target)?.topic(&action::feedback_of(name))?;
-        let text = action::info(name, feedback.as_ref(), self.show_types, self.count);
+        let typed = &self.action_name;
+        let name = full_name(typed).map_err(|refused| UserError(refused.0))?;
+        let feedback = Graph::reach(&self.target)?.topic(&action::feedback_of(&name))?;
+        let text = action::info(typed, feedback.as_ref(), self.show_types, self.count);
         print_text(&text)
     }
 }

@@ -70,10 +70,7 @@ impl Diag {
             let mut printed = 0;
             for status in selected {
                 let key = key(status);
-                let is_known = known
-                    .get(&key)
-                    .is_some_and(|before| *before == status.level);
-                if !is_known && (is_first || self.is_shown(status, known.get(&key))) {
+                if self.is_shown(status, known.get(&key)) {
                     self.write(&mut output, status, answer.timestamp_seconds)?;
                     printed += 1;
                 }
@@ -113,9 +110,12 @@ impl Diag {
             && (self.follow || self.is_severe(&status.level))
     }
 
-    /// Returns whether a change from this level is printed: one of both is severe enough.
+    /// Returns whether a change from this level is printed: one of both is severe enough. Without a
+    /// level before, the status is new.
     fn is_shown(&self, status: &DiagnosticStatus<'_>, before: Option<&String>) -> bool {
-        self.is_severe(&status.level) || before.is_some_and(|before| self.is_severe(before))
+        let is_changed = before.is_none_or(|before| *before != status.level);
+        let is_severe = |level: &str| self.is_severe(level);
+        is_changed && (is_severe(&status.level) || before.is_some_and(|before| is_severe(before)))
     }
 
     fn is_severe(&self, level: &str) -> bool {
@@ -162,4 +162,31 @@ fn key(status: &DiagnosticStatus<'_>) -> Key {
 
 fn level(status: &DiagnosticStatus<'_>) -> Option<DiagnosticLevel> {
     DiagnosticLevel::named(&status.level)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_status_is_printed_if_it_or_the_one_before_is_severe_enough() {
+        let diag = Diag {
+            pattern: None,
+            level: "error".to_owned(),
+            topic: None,
+            verbose: false,
+            follow: true,
+            target: Target::default(),
+        };
+        let is_shown = |level: &'static str, before: Option<&str>| {
+            let status = DiagnosticStatus {
+                level: level.into(),
+                ..DiagnosticStatus::default()
+            };
+            diag.is_shown(&status, before.map(str::to_owned).as_ref())
+        };
+        assert!(is_shown("error", None) && !is_shown("ok", None));
+        assert!(is_shown("stale", Some("ok")) && is_shown("ok", Some("error")));
+        assert!(!is_shown("error", Some("error")) && !is_shown("warn", Some("ok")));
+    }
 }

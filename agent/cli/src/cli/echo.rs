@@ -9,14 +9,14 @@ use clap::Args;
 use ros2probe::client::{Agent, Target};
 use ros2probe::ros2::Refused;
 use ros2probe::ros2::echo::{self, FieldPath, Lost, mixed_offers};
-use ros2probe::ros2::name::full_name;
+use ros2probe::ros2::name::{full_name, full_type};
 use ros2probe_api::endpoints::Endpoint;
 use ros2probe_api::latched::Latched;
 use ros2probe_api::samples::Sample;
 use ros2probe_api::topics::Topic;
 use ros2probe_daemon::escape::visible_lines;
-use ros2probe_message::TypeName;
 use ros2probe_message::filter::Filter;
+use ros2probe_message::{Kind, TypeName};
 
 use super::follow::{Printing, StreamItem, StreamStatus, Types, follow, for_stdout, topic};
 use super::notes::{NOT_ALL_PRINTED, Notes};
@@ -90,7 +90,7 @@ pub(crate) struct Echo {
 }
 
 impl Echo {
-    pub(crate) fn run(self) -> Result<ExitCode> {
+    pub(crate) fn run(mut self) -> Result<ExitCode> {
         let options = self.options()?;
         let name = full_name(&self.topic_name).map_err(user_error)?;
         if self.lost_messages {
@@ -98,13 +98,15 @@ impl Echo {
                 "WARNING: '--lost-messages' is deprecated; lost messages are reported by default"
             );
         }
-        if let Some(message_type) = &self.message_type {
+        if let Some(typed) = self.message_type.take() {
+            let message_type = full_type(&typed, Kind::Message);
             let known: Result<TypeName, _> = message_type.parse();
             known.map_err(|_| UserError("The passed message type is invalid".to_owned()))?;
+            self.message_type = Some(message_type);
         }
         let domain_id = self.target.domain()?;
         let agent = Agent::reach_stream(&self.target)?;
-        let types = Types::with_agent(self.printing.library(&self.target), &agent, domain_id);
+        let types = Types::new(self.printing.library(&self.target), &agent, domain_id);
         let mut output = Output::new();
 
         // A capture's topics are complete only after its end.

@@ -1,5 +1,6 @@
 //! `rp service echo` and `rp action echo`: print service events and the parts of actions.
 
+use std::borrow::Cow;
 use std::process::ExitCode;
 
 use anyhow::Result;
@@ -7,8 +8,9 @@ use clap::Args;
 use ros2probe::client::{Agent, Target};
 use ros2probe::ros2::Refused;
 use ros2probe::ros2::echo::{self, Echo};
-use ros2probe::ros2::name::full_name;
+use ros2probe::ros2::name::{full_name, full_type};
 use ros2probe_daemon::escape::visible_lines;
+use ros2probe_message::{Kind, TypeName};
 
 use super::follow::{Printing, StreamItem, StreamStatus, Types, follow, for_stdout, topic};
 use super::notes::{NOT_ALL_PRINTED, Notes};
@@ -64,6 +66,9 @@ impl ServiceEcho {
     pub(crate) fn run(self) -> Result<ExitCode> {
         let name = full_name(&self.service_name).map_err(user_error)?;
         let events = format!("{name}/_service_event");
+        let typed = self.service_type.as_deref();
+        let service_type = typed.map(|typed| checked_type(typed, Kind::Service));
+        let service_type = service_type.transpose()?;
         let domain_id = self.target.domain()?;
         let agent = Agent::reach_stream(&self.target)?;
         let mut output = Output::new();
@@ -71,20 +76,20 @@ impl ServiceEcho {
         if self.target.replay.is_none() {
             if self.service_type.is_none() {
                 let names = names_of(&agent, domain_id)?;
-                if names.services.iter().all(|service| service.name != name) {
-                    let text = format!("Cannot find type for '{}'", self.service_name);
-                    return Err(UserError(text).into());
-                }
+                let types = names.services.iter().find(|service| service.name == name);
+                let types = types.map(|service| service.types.as_slice());
+                check_single_type(&self.service_name, types).map_err(user_error)?;
             }
             let known = topic(&agent, domain_id, &events)?;
             if known.is_none_or(|known| known.publishers.is_empty()) {
+                let typed = &self.service_name;
                 output.write(&format!(
-                    "No publishers on topic '{events}'; is service introspection on the client or \
-                     server enabled?\n"
+                    "No publishers on topic '{typed}/_service_event'; is service introspection on \
+                     the client or server enabled?\n"
                 ))?;
             }
         }
-        let expected = self.service_type.map(|name| format!("{name}_Event"));
+        let expected = service_type.map(|name| format!("{name}_Event"));
         let topics = [(None, events)];
         print(
             &agent,
@@ -101,15 +106,19 @@ impl ActionEcho {
     pub(crate) fn run(self) -> Result<ExitCode> {
         let parts = selected_parts(self.interfaces.as_deref()).map_err(user_error)?;
         let name = full_name(&self.action_name).map_err(user_error)?;
+        let typed = self.action_type.as_deref();
+        let action_type = typed.map(|typed| checked_type(typed, Kind::Action));
+        let action_type = action_type.transpose()?;
         let domain_id = self.target.domain()?;
-        if let Some(action_type) = &self.action_type {
-            let types = Types::new(self.printing.library(&self.target));
-            types.find(&format!("{action_type}_FeedbackMessage"), None)?;
-        }
         let agent = Agent::reach_stream(&self.target)?;
+        let feedback = format!("{name}/_action/feedback");
+        if let Some(action_type) = &action_type {
+            let types = Types::new(self.printing.library(&self.target), &agent, domain_id);
+            let expected = format!("{action_type}_FeedbackMessage");
+            find_definition(&types, &agent, domain_id, &feedback, &expected)?;
+        }
         if self.target.replay.is_none() && self.action_type.is_none() {
             let names = names_of(&agent, domain_id)?;
-            let feedback = format!("{name}/_action/feedback");
             if names.topics.iter().all(|topic| topic.name != feedback) {
                 let text = format!("Cannot find type for '{}'", self.action_name);
                 return Err(UserError(text).into());
@@ -122,6 +131,46 @@ impl ActionEcho {
         let output = Output::new();
         print(&agent, &self.target, &self.printing, &topics, None, output)
     }
+}
+
+/// Returns the full name of a type on the command line. Fails with ros2cli's message, which is the
+/// same for a service and an action.
+fn checked_type(typed: &str, kind: Kind) -> Result<String> {
+    let name = full_type(typed, kind);
+    let known: Result<TypeName, _> = name.parse();
+    if known.is_ok_and(|known| known.kind() == kind) {
+        return Ok(name);
+    }
+    let text = format!("The service type '{typed}' is invalid");
+    Err(UserError(text).into())
+}
+
+/// Checks that the service has one type. Fails with ros2cli's message otherwise.
+fn check_single_type(typed: &str, types: Option<&[Cow<'_, str>]>) -> Result<(), Refused> {
+    match types {
+        None => Err(Refused(format!("Cannot find type for '{typed}'"))),
+        Some([_, _, ..]) => {
+            let text = format!("More than one type associated with service '{typed}'");
+            Err(Refused(text))
+        }
+        Some(_) => Ok(()),
+    }
+}
+
+/// Finds the definition of this type, which may be the one that the topic's first publisher
+/// announces. Fails without a definition.
+fn find_definition(
+    types: &Types<'_>,
+    agent: &Agent,
+    domain_id: u32,
+    name: &str,
+    expected: &str,
+) -> Result<()> {
+    let known = topic(agent, domain_id, name)?;
+    let publisher = known.as_ref().and_then(|known| known.publishers.first());
+    let hash = publisher.and_then(|publisher| publisher.definition_hash());
+    types.find_for(name, expected, hash)?;
+    Ok(())
 }
 
 /// Returns the parts that `--interfaces` selects. An unknown part fails with ros2cli's message.
@@ -155,9 +204,10 @@ fn print(
     expected: Option<&str>,
     mut output: Output,
 ) -> Result<ExitCode> {
-    let mut types = Types::new(printing.library(target));
-    if let Some(expected) = expected {
-        types.find(expected, None)?;
+    let domain_id = target.domain()?;
+    let mut types = Types::new(printing.library(target), agent, domain_id);
+    if let (Some(expected), [(_, name)]) = (expected, topics) {
+        find_definition(&types, agent, domain_id, name, expected)?;
     }
     let mut echo = Echo::new(echo::Options {
         dialect: target.dialect(),
@@ -167,7 +217,6 @@ fn print(
         ..echo::Options::default()
     });
     let names: Vec<_> = topics.iter().map(|(_, name)| name.clone()).collect();
-    let domain_id = target.domain()?;
     let is_replay = target.replay.is_some();
     let notes = Notes::begin(agent, domain_id, is_replay, &names, NOT_ALL_PRINTED);
     let mut notes = notes.of_parts();

@@ -188,8 +188,10 @@ pub(crate) fn topic(agent: &Agent, domain_id: u32, name: &str) -> Result<Option<
 /// Definitions for the messages of each writer.
 pub(crate) struct Types<'a> {
     library: Library,
-    /// The agent that may have other definitions, and the domain of the topics.
-    agent: Option<(&'a Agent, u32)>,
+    /// The agent, which may have other definitions.
+    agent: &'a Agent,
+    /// Domain of the topics.
+    domain_id: u32,
     /// The definition of each writer's type, or the time at which no source had one.
     writers: HashMap<String, Result<Arc<MessageType>, Instant>>,
     /// Types without a definition; each is reported once.
@@ -197,21 +199,15 @@ pub(crate) struct Types<'a> {
 }
 
 impl<'a> Types<'a> {
-    pub(crate) fn new(library: Library) -> Self {
+    /// Returns definitions of the library and of the agent. The agent has those that nodes
+    /// described, and may have other packages installed.
+    pub(crate) fn new(library: Library, agent: &'a Agent, domain_id: u32) -> Self {
         Self {
             library,
-            agent: None,
+            agent,
+            domain_id,
             writers: HashMap::new(),
             undefined: Vec::new(),
-        }
-    }
-
-    /// Returns definitions that also come from the agent. It has those that nodes described, and
-    /// may have other packages installed.
-    pub(crate) fn with_agent(library: Library, agent: &'a Agent, domain_id: u32) -> Self {
-        Self {
-            agent: Some((agent, domain_id)),
-            ..Self::new(library)
         }
     }
 
@@ -230,17 +226,14 @@ impl<'a> Types<'a> {
 
     /// Adds the agent's definition of a topic's type. The library returns it only for its hash.
     fn offer_definition(&self, topic: &str) {
-        let Some((agent, domain_id)) = self.agent else {
-            return;
-        };
         let topic = encoded(topic.strip_prefix('/').unwrap_or(topic));
-        let path = format!("/topics/{topic}/definition?domain_id={domain_id}");
+        let path = format!("/topics/{topic}/definition?domain_id={}", self.domain_id);
         if let Ok(Definition {
             name,
             definition: Some(text),
             equivalence_hash,
             ..
-        }) = agent.get(&path)
+        }) = self.agent.get(&path)
             && let Ok(root) = name.parse()
             && let Ok(found) = MessageType::parse(&root, &text)
         {
@@ -261,9 +254,7 @@ impl<'a> Types<'a> {
         match self.writers.get(&sample.writer) {
             Some(Ok(known)) => return Some(Arc::clone(known)),
             // A node may describe the type to the agent at any time.
-            Some(Err(at)) if self.agent.is_none() || at.elapsed() < DEFINITION_RETRY_INTERVAL => {
-                return None;
-            }
+            Some(Err(at)) if at.elapsed() < DEFINITION_RETRY_INTERVAL => return None,
             _ => {}
         }
         let offered = sample.offered.as_ref();
@@ -297,21 +288,19 @@ impl<'a> Types<'a> {
 
 /// Passes messages for which an expression is true. Messages without a definition, or of another
 /// type, do not pass; stderr reports each such type once.
-pub(crate) struct MessageFilter {
+pub(crate) struct MessageFilter<'a> {
     filter: Filter,
-    types: Types<'static>,
+    types: Types<'a>,
     is_reported: bool,
 }
 
-impl MessageFilter {
-    pub(crate) fn new(filter: &str, library: Library) -> Result<Self> {
-        let filter = Filter::parse(filter).map_err(|error| UserError(error.to_string()))?;
-        let types = Types::new(library);
-        Ok(Self {
+impl<'a> MessageFilter<'a> {
+    pub(crate) fn new(filter: Filter, types: Types<'a>) -> Self {
+        Self {
             filter,
             types,
             is_reported: false,
-        })
+        }
     }
 
     pub(crate) fn is_passed(&mut self, sample: &Sample, payload: &[u8]) -> Result<bool> {

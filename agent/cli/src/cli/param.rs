@@ -108,14 +108,7 @@ impl Changes {
                 eprintln!("rp: no changes were seen since the agent started");
                 names_of(&agent, domain_id)?;
             }
-            // The list is in the order of time, and old changes leave it at its begin.
-            let last = printed.last();
-            let known = last.and_then(|last| answer.changes.iter().rposition(|each| each == last));
-            for change in answer
-                .changes
-                .iter()
-                .skip(known.map_or(0, |known| known + 1))
-            {
+            for change in unprinted(&answer.changes, printed.last()) {
                 output.write(&line(change))?;
             }
             if !self.follow {
@@ -144,6 +137,27 @@ fn note(answer: &Parameters<'_>) {
     }
 }
 
+/// Returns the changes after the last printed one. The list is in the order of time, and old
+/// changes leave it at its beginning.
+fn unprinted<'a>(
+    changes: &'a [ParameterChange<'static>],
+    last: Option<&ParameterChange<'static>>,
+) -> &'a [ParameterChange<'static>] {
+    let known = last.and_then(|last| changes.iter().rposition(|each| is_same(each, last)));
+    let begin = known.map_or(0, |known| known + 1);
+    changes.get(begin..).unwrap_or_default()
+}
+
+/// Returns whether both are one change. The wall clock may have been set between their answers.
+fn is_same(one: &ParameterChange<'static>, other: &ParameterChange<'static>) -> bool {
+    let other_then = || ParameterChange {
+        timestamp_seconds: one.timestamp_seconds,
+        ..other.clone()
+    };
+    // An older agent sends no monotonic time.
+    one == other || one.monotonic_ns != 0 && *one == other_then()
+}
+
 /// Returns the line of a change.
 fn line(change: &ParameterChange<'_>) -> String {
     let at = time(change.timestamp_seconds, &TimeZone::system());
@@ -162,4 +176,42 @@ fn line(change: &ParameterChange<'_>) -> String {
         visible(&change.ros_node),
         visible(&change.name)
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn change(at: u64, step: f64) -> ParameterChange<'static> {
+        ParameterChange {
+            timestamp_seconds: at as f64 + step,
+            monotonic_ns: at * 1_000_000_000,
+            ros_node: "/planner".into(),
+            name: "max_speed".into(),
+            value: Some("0.5".into()),
+            ..ParameterChange::default()
+        }
+    }
+
+    #[test]
+    fn a_printed_change_is_recognized_after_a_step_of_the_clock() {
+        let changes = |step| [1, 2, 3].map(|at| change(at, step));
+        assert_eq!(unprinted(&changes(0.0), None), changes(0.0));
+        let last = change(2, 0.0);
+        for step in [0.0, 3600.0, -0.5] {
+            let found = unprinted(&changes(step), Some(&last)).to_vec();
+            assert_eq!(found, [change(3, step)]);
+        }
+        let evicted = change(0, 0.0);
+        assert_eq!(unprinted(&changes(0.0), Some(&evicted)), changes(0.0));
+    }
+
+    #[test]
+    fn equal_changes_of_an_older_agent_differ_by_their_time() {
+        let changes = [1, 2].map(|at| ParameterChange {
+            monotonic_ns: 0,
+            ..change(at, 0.0)
+        });
+        assert_eq!(unprinted(&changes, changes.first()), &changes[1..]);
+    }
 }

@@ -14,8 +14,10 @@ use ros2probe::ros2::rates::{Arrival, End, Named, Origin, Quantity, Rates};
 use ros2probe::ros2::{Dialect, Refused};
 use ros2probe_api::path::encoded;
 use ros2probe_api::samples::{Line, MissedReason, Sample};
+use ros2probe_message::Library;
+use ros2probe_message::filter::Filter;
 
-use super::follow::{AGENT_ENDED, END_OF_CAPTURE, MessageFilter, library};
+use super::follow::{AGENT_ENDED, END_OF_CAPTURE, MessageFilter, Types, library};
 use super::interrupt::EXIT_INTERRUPTED;
 use super::notes::Notes;
 use super::shared::{Matching, Spinning, names_of};
@@ -93,18 +95,16 @@ struct Options {
 impl Hz {
     pub(crate) fn run(self, hidden: bool) -> Result<ExitCode> {
         let target = &self.options.target;
-        let library = || library(target, self.definitions);
-        let sieve = self
-            .filter
-            .map(|filter| MessageFilter::new(&filter, library()));
-        let sieve = sieve.transpose()?;
+        let filter = self.filter.as_deref().map(Filter::parse).transpose();
+        let filter = filter.map_err(|error| UserError(error.to_string()))?;
+        let filter = filter.map(|filter| (filter, library(target, self.definitions)));
         measure(
             Quantity::Rate,
             self.window,
             self.topics,
             target,
             hidden,
-            sieve,
+            filter,
         )
     }
 
@@ -160,7 +160,7 @@ fn measure(
     topics: Topics,
     target: &Target,
     hidden: bool,
-    sieve: Option<MessageFilter>,
+    filter: Option<(Filter, Library)>,
 ) -> Result<ExitCode> {
     let dialect = target.dialect();
     let domain_id = target.domain()?;
@@ -183,10 +183,22 @@ fn measure(
         .collect();
     let agent = Agent::reach_stream(target)?;
     let is_replay = target.replay.is_some();
-    let notes = Notes::begin(&agent, domain_id, is_replay, &names, sampled(quantity));
+    if !is_replay {
+        rates = rates.live();
+    }
+    let sieve = filter.map(|(filter, library)| {
+        let types = Types::new(library, &agent, domain_id);
+        MessageFilter::new(filter, types)
+    });
+    let consequence = sampled(quantity, sieve.is_some());
+    let notes = Notes::begin(&agent, domain_id, is_replay, &names, consequence);
     rates.sampled_reported(notes.sampled());
-    let payload = sieve.is_some();
-    let path = format!("/samples?{query}&domain_id={domain_id}&payload={payload}");
+    // As in ros2cli, the subscription is volatile: a message that was sent before does not count.
+    let payload = match sieve {
+        Some(_) => "&payload=true&latched=false",
+        None => "",
+    };
+    let path = format!("/samples?{query}&domain_id={domain_id}{payload}");
     let mut lines = agent.stream(&path)?;
     let mut output = Output::new();
     let mut measurement = Measurement {
@@ -228,7 +240,7 @@ struct Measurement<'a> {
     domain_id: u32,
     rates: Rates,
     notes: Notes<'a>,
-    sieve: Option<MessageFilter>,
+    sieve: Option<MessageFilter<'a>>,
     code: ExitCode,
 }
 
@@ -251,11 +263,7 @@ impl Measurement<'_> {
                 Ok(())
             }
             Line::Missed(missed) => {
-                // Missing payloads do not change the counts of arrivals.
-                if matches!(
-                    missed.reason,
-                    MissedReason::QueueFull | MissedReason::Unannounced
-                ) {
+                if is_uncounted(missed.reason, self.sieve.is_some()) {
                     self.notes.missed(&missed);
                 }
                 Ok(())
@@ -277,7 +285,9 @@ impl Measurement<'_> {
     }
 
     fn sample(&mut self, sample: &Sample, payload: &Bytes) -> Result<Result<(), End>> {
-        self.notes.received(&sample.topic, false);
+        // Without a filter, `Rates` reports sampled topics.
+        let is_reported = sample.sampled && self.sieve.is_some();
+        self.notes.received(&sample.topic, is_reported);
         let arrival = Arrival {
             time: sample.time_ns,
             size: sample.size,
@@ -328,9 +338,21 @@ impl Topics {
     }
 }
 
+/// Returns whether messages that are missing for this reason are not counted. Without a filter,
+/// messages count without their payloads.
+const fn is_uncounted(reason: MissedReason, is_filtered: bool) -> bool {
+    match reason {
+        MissedReason::QueueFull | MissedReason::Unannounced => true,
+        MissedReason::NotCaptured => is_filtered,
+        // No subscriber received them.
+        MissedReason::Incomplete | MissedReason::Lost => false,
+    }
+}
+
 /// Returns the consequence of sampling for this quantity.
-const fn sampled(quantity: Quantity) -> &'static str {
+const fn sampled(quantity: Quantity, is_filtered: bool) -> &'static str {
     match quantity {
+        _ if is_filtered => "unseen messages are not counted",
         Quantity::Rate | Quantity::Bandwidth => {
             "unseen messages are counted from sequence numbers and their times estimated"
         }
@@ -360,4 +382,23 @@ fn unnamed(quantity: Quantity, dialect: Dialect) -> anyhow::Error {
 fn positive(text: &str) -> Result<usize, UserError> {
     let value = text.parse().ok().filter(|value| *value > 0);
     value.ok_or_else(|| UserError("value must be a positive integer".to_owned()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_message_without_its_payload_counts_only_without_a_filter() {
+        assert!(is_uncounted(MissedReason::NotCaptured, true));
+        assert!(!is_uncounted(MissedReason::NotCaptured, false));
+        for is_filtered in [true, false] {
+            assert!(is_uncounted(MissedReason::QueueFull, is_filtered));
+            assert!(!is_uncounted(MissedReason::Lost, is_filtered));
+        }
+        let counted = "unseen messages are counted from sequence numbers";
+        assert!(sampled(Quantity::Rate, false).starts_with(counted));
+        let filtered = sampled(Quantity::Rate, true);
+        assert_eq!(filtered, "unseen messages are not counted");
+    }
 }

@@ -16,7 +16,9 @@ use ros2probe_api::endpoints::Endpoint;
 use ros2probe_api::samples::Sample;
 use ros2probe_message::filter::{Filter, Subject};
 use ros2probe_message::yaml::{self, Style};
-use ros2probe_message::{Decoded, Limits, MessageType, Truncation, Value, csv, decode, python};
+use ros2probe_message::{
+    Decoded, Limits, MessageType, Scalar, Truncation, Value, csv, decode, python,
+};
 
 /// Maximum number of writers whose unreadable messages are counted separately.
 const MAX_WRITERS: usize = 256;
@@ -105,6 +107,10 @@ impl Echo {
         payload: &[u8],
     ) -> Result<MessageText, Refused> {
         if self.options.raw {
+            let mut fields = self.options.fields.iter();
+            if let Some(refused) = fields.find_map(FieldPath::missing_in_bytes) {
+                return Err(refused);
+            }
             if !self.passes(Subject::Bytes(payload))? {
                 return Ok(MessageText::default());
             }
@@ -277,11 +283,11 @@ impl Echo {
                     out.push_str("---\n");
                 }
             }
-            Selected::Value(_) | Selected::Element(_) => {
+            Selected::Value(_) | Selected::Element(_) | Selected::NumpyElement(_) => {
                 if *include_info {
                     out.push_str(&info_around(sample));
                 }
-                out.push_str(&part.value().map_or_else(String::new, python::str));
+                out.push_str(&part.text());
                 out.push('\n');
                 if is_last && !(*csv && *dialect == Dialect::Humble) {
                     out.push_str("---\n");
@@ -374,15 +380,17 @@ impl Selected<'_> {
         match self {
             Self::Message(message) => Subject::Message(message),
             Self::Value(value) => Subject::Value(value),
-            Self::Element(value) => Subject::Value(value),
+            Self::Element(value) | Self::NumpyElement(value) => Subject::Value(value),
         }
     }
 
-    fn value(&self) -> Option<&Value<'_>> {
+    /// Returns `str()` of a part that is not a message.
+    fn text(&self) -> String {
         match self {
-            Self::Message(_) => None,
-            Self::Value(value) => Some(value),
-            Self::Element(value) => Some(value),
+            Self::Message(_) => String::new(),
+            Self::NumpyElement(Value::Scalar(Scalar::Float32(number))) => python::float32(*number),
+            Self::Value(value) => python::str(value),
+            Self::Element(value) | Self::NumpyElement(value) => python::str(value),
         }
     }
 }

@@ -1,6 +1,7 @@
-//! Topic names on the command line.
+//! Names of topics and types on the command line.
 
 use super::Refused;
+use ros2probe_message::Kind;
 
 /// Returns the full name of a topic. A relative name is in the root namespace, as in ros2cli.
 ///
@@ -19,6 +20,18 @@ pub fn full_name(typed: &str) -> Result<String, Refused> {
             "Invalid topic name: {why}:\n  '{name}'\n   {:at$}^",
             ""
         ))),
+    }
+}
+
+/// Returns the full name of a type. As in ros2cli, a name of two parts has this kind:
+/// `std_msgs/String` is `std_msgs/msg/String`. Other names are returned as they are.
+#[must_use]
+pub fn full_type(typed: &str, kind: Kind) -> String {
+    match typed.split_once('/') {
+        Some((package, name)) if !name.contains('/') => {
+            format!("{package}/{}/{name}", kind.as_str())
+        }
+        _ => typed.to_owned(),
     }
 }
 
@@ -84,6 +97,20 @@ mod tests {
             ("/_hidden", "/_hidden"),
         ] {
             assert_eq!(full_name(typed).as_deref(), Ok(name));
+        }
+    }
+
+    #[test]
+    fn a_type_of_two_parts_has_the_kind_of_the_command() {
+        for (typed, kind, name) in [
+            ("std_msgs/String", Kind::Message, "std_msgs/msg/String"),
+            ("std_srvs/Empty", Kind::Service, "std_srvs/srv/Empty"),
+            ("a/Fibonacci", Kind::Action, "a/action/Fibonacci"),
+            ("a/srv/B", Kind::Message, "a/srv/B"),
+            ("a/b/c/D", Kind::Message, "a/b/c/D"),
+            ("String", Kind::Message, "String"),
+        ] {
+            assert_eq!(full_type(typed, kind), name);
         }
     }
 

@@ -294,6 +294,7 @@ fn messages_beyond_the_bytes_of_all_queues_evict_the_oldest_until_the_queue_is_r
         queue_bytes: 1 << 20,
         overflow: Overflow::DropOldest,
         is_clock_complete: false,
+        latched: true,
         label: "test".to_owned(),
     };
     let mut reader = all.open(request()).unwrap();

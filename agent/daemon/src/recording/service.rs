@@ -381,6 +381,7 @@ impl Recordings {
             queue_bytes: self.queue_bytes,
             overflow: Overflow::DropOldest,
             is_clock_complete: true,
+            latched: true,
             label: format!("recording {name}"),
         })?)
     }

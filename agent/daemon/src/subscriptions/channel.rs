@@ -99,7 +99,7 @@ impl Channel {
         Self {
             id,
             wanted: Mutex::new(Wanted {
-                fresh: Some(Arc::clone(&selection)),
+                fresh: request.latched.then(|| Arc::clone(&selection)),
                 selection,
             }),
             request: ChannelOptions {

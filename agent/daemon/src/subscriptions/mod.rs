@@ -70,6 +70,8 @@ pub struct Request {
     /// Whether [`Item::Clock`] comes only after samples that wait for lower numbers: by some seconds
     /// later while a reliable writer repeats a sample.
     pub is_clock_complete: bool,
+    /// Whether a reader with payloads first receives the kept last messages of its topics.
+    pub latched: bool,
     /// Name of the client, for logs.
     pub label: String,
 }

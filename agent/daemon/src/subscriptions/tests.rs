@@ -29,6 +29,7 @@ fn request(depth: Depth, queue_bytes: usize, overflow: Overflow) -> Request {
         queue_bytes,
         overflow,
         is_clock_complete: false,
+        latched: true,
         label: "test".to_owned(),
     }
 }
@@ -324,6 +325,24 @@ async fn a_reader_receives_its_items_and_then_the_end() {
         .open(request(Depth::Arrivals, 1 << 16, Overflow::DropOldest))
         .unwrap();
     assert_eq!(late.next().await, Some(Item::End("end of capture")));
+}
+
+#[test]
+fn kept_messages_are_sent_first_unless_the_request_excludes_them() {
+    let all = subscriptions(caps());
+    for (latched, received) in [(true, vec![1, 2]), (false, vec![2])] {
+        let mut reader = all
+            .open(Request {
+                latched,
+                ..request(Depth::Payloads, 1 << 16, Overflow::DropOldest)
+            })
+            .unwrap();
+        let requests = all.take_changed().unwrap();
+        all.confirm_applied(&requests, |_| vec![sample(1, Some(5))]);
+        let id = requests[0].id;
+        all.deliver(vec![enqueued(&[id], 2, Some(5))], None);
+        assert_eq!(numbers(&mut reader), received);
+    }
 }
 
 #[test]

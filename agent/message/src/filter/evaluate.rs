@@ -212,12 +212,40 @@ impl Number {
         }
     }
 
+    /// Compares two numbers exactly, as Python does; `None` if one is not a number.
     fn compare(self, other: Self) -> Option<Ordering> {
         match (self, other) {
             (Self::Int(one), Self::Int(other)) => Some(one.cmp(&other)),
-            _ => self.float().partial_cmp(&other.float()),
+            (Self::Float(one), Self::Float(other)) => one.partial_cmp(&other),
+            (Self::Int(one), Self::Float(other)) => compare_with_float(one, other),
+            (Self::Float(one), Self::Int(other)) => {
+                compare_with_float(other, one).map(Ordering::reverse)
+            }
         }
     }
+}
+
+/// Compares an integer with a float without rounding the integer.
+fn compare_with_float(one: i128, other: f64) -> Option<Ordering> {
+    /// 2^127, the first float above all integers here.
+    const BEYOND: f64 = -(i128::MIN as f64);
+    if other.is_nan() {
+        return None;
+    }
+    if other >= BEYOND {
+        return Some(Ordering::Less);
+    }
+    if other < -BEYOND {
+        return Some(Ordering::Greater);
+    }
+    #[expect(clippy::cast_possible_truncation, reason = "a whole number in range")]
+    let whole = other.trunc() as i128;
+    let rest = other.fract();
+    let order = match one.cmp(&whole) {
+        Ordering::Equal => 0.0_f64.partial_cmp(&rest)?,
+        order => order,
+    };
+    Some(order)
 }
 
 fn evaluate<'a>(node: &Node, subject: &Object<'a>) -> Result<Object<'a>, FilterError> {
@@ -409,10 +437,42 @@ fn floats<'a>(operator: Operator, one: f64, other: f64) -> Result<Object<'a>, Ex
         Operator::Subtract => one - other,
         Operator::Multiply => one * other,
         Operator::Divide => one / other,
-        Operator::FloorDivide => (one / other).floor(),
-        Operator::Remainder => one - (one / other).floor() * other,
+        Operator::FloorDivide => floor_divide(one, other),
+        Operator::Remainder => remainder(one, other),
         Operator::Power => one.powf(other),
     }))
+}
+
+/// Returns `one % other` with the sign of `other`, as CPython computes it.
+fn remainder(one: f64, other: f64) -> f64 {
+    let rest = one % other;
+    if rest == 0.0 {
+        return 0.0_f64.copysign(other);
+    }
+    if (rest < 0.0) == (other < 0.0) {
+        rest
+    } else {
+        rest + other
+    }
+}
+
+/// Returns `one // other`, as CPython computes it: the rounded quotient may be a whole number that
+/// is too large.
+fn floor_divide(one: f64, other: f64) -> f64 {
+    let rest = one % other;
+    let mut quotient = (one - rest) / other;
+    if rest != 0.0 && (rest < 0.0) != (other < 0.0) {
+        quotient -= 1.0;
+    }
+    if quotient == 0.0 {
+        return 0.0_f64.copysign(one / other);
+    }
+    let floor = quotient.floor();
+    if quotient - floor > 0.5 {
+        floor + 1.0
+    } else {
+        floor
+    }
 }
 
 fn compare(

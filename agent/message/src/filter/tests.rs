@@ -52,6 +52,29 @@ fn expressions_evaluate_as_in_python() {
             "m.n // 2 == -2 and m.n % 2 == 1 and m.n / 2 == -1.5 and 7.5 // 2 == 3",
             true,
         ),
+        (
+            "1 % 0.1 == 0.09999999999999995 and 1 // 0.1 == 9.0 and 1e20 % 3 == 1",
+            true,
+        ),
+        (
+            "-7.5 % 2 == 0.5 and 7.5 % -2 == -0.5 and 7.5 // -2 == -4 and -7.5 // 2 == -4",
+            true,
+        ),
+        (
+            "str(4.0 % -2) == '-0.0' and str(-4.0 % 2) == '0.0' and str(0.0 // -1) == '-0.0'",
+            true,
+        ),
+        ("2 ** 53 + 1 == 2.0 ** 53", false),
+        (
+            "2 ** 53 < 2.0 ** 53 + 2 and 2.0 ** 53 < 2 ** 53 + 1 and 2 ** 53 == 2.0 ** 53",
+            true,
+        ),
+        ("-2 > -2.5 and -3 < -2.5 and 2 < 2.5 < 3", true),
+        ("2 ** 126 < 1e300 and -(2 ** 126) > -1e300", true),
+        (
+            "2 < float('nan') or 2 > float('nan') or 2 == float('nan')",
+            false,
+        ),
         // The smallest number that the filter supports.
         (
             "-(2 ** 126) * 2 % 3 == 1 and -(2 ** 126) * 2 // 3 < -(2 ** 125)",

@@ -25,8 +25,10 @@ enum Step {
 pub(super) enum Selected<'a> {
     Message(&'a Message<'a>),
     Value(&'a Value<'a>),
-    /// An element of an array without a value of its own.
+    /// An element of a sequence, without a value of its own.
     Element(Value<'a>),
+    /// An element of a numpy array, which has the element's type.
+    NumpyElement(Value<'a>),
 }
 
 impl FromStr for FieldPath {
@@ -60,6 +62,18 @@ impl FromStr for FieldPath {
 }
 
 impl FieldPath {
+    /// Returns the error for a field of a serialized message, which has no names. Returns `None`
+    /// for a path that begins with an index.
+    pub(super) fn missing_in_bytes(&self) -> Option<Refused> {
+        let Some(Step::Name(name)) = self.steps.first() else {
+            return None;
+        };
+        let text = &self.text;
+        Some(Refused(format!(
+            "Invalid field '{text}': 'bytes' object has no attribute '{name}'"
+        )))
+    }
+
     pub(super) fn select<'a>(&self, message: &'a Message<'a>) -> Result<Selected<'a>, Refused> {
         let mut found = Selected::Message(message);
         for step in &self.steps {
@@ -70,7 +84,10 @@ impl FieldPath {
                 (Selected::Value(Value::Array(array)), Step::Index(index)) => match &array.items {
                     Items::Scalars(scalars) => {
                         let element = scalars.get(*index).map(Value::Scalar);
-                        element.map(Selected::Element)
+                        element.map(|element| match array.is_fixed() {
+                            true => Selected::NumpyElement(element),
+                            false => Selected::Element(element),
+                        })
                     }
                     Items::Texts(texts) => {
                         let element = texts.get(*index).map(|text| Value::Text(text.clone()));
@@ -111,7 +128,7 @@ impl<'a> Selected<'a> {
         match self {
             Self::Message(message) => message.structure.name.name().to_owned(),
             Self::Value(value) => python::type_name(value).to_owned(),
-            Self::Element(value) => python::type_name(value).to_owned(),
+            Self::Element(value) | Self::NumpyElement(value) => python::type_name(value).to_owned(),
         }
     }
 }

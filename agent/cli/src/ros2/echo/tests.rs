@@ -78,6 +78,26 @@ fn fields_print_as_yaml_or_as_python() {
 }
 
 #[test]
+fn an_element_of_a_numpy_array_prints_as_few_digits_as_its_type_has() {
+    let schema = "float32[2] q\nfloat32[] r\nint8[1] n\n";
+    let message_type = MessageType::parse(&"a/msg/B".parse().unwrap(), schema).unwrap();
+    let mut payload: Vec<u8> = vec![0, 1, 0, 0];
+    payload.extend([0.5_f32, 0.1].map(f32::to_le_bytes).concat());
+    payload.extend([1, 0, 0, 0]);
+    payload.extend(0.1_f32.to_le_bytes());
+    payload.push(7);
+    for (path, text) in [
+        ("q.[1]", "0.1\n---\n"),
+        ("r.[0]", "0.10000000149011612\n---\n"),
+        ("n.[0]", "7\n---\n"),
+    ] {
+        let mut echo = Echo::new(fields(&[path]));
+        let printed = echo.message(&sample(), Some(&message_type), &payload);
+        assert_eq!(printed.unwrap().out.as_deref(), Some(text), "{path}");
+    }
+}
+
+#[test]
 fn missing_fields_are_refused_with_the_text_of_ros2cli() {
     for (path, reason) in [
         ("x", "'B' object has no attribute 'x'"),
@@ -91,6 +111,12 @@ fn missing_fields_are_refused_with_the_text_of_ros2cli() {
         let refused = echo(fields(&[path])).unwrap_err();
         assert_eq!(refused.0, format!("Invalid field '{path}': {reason}"));
     }
+    let raw = Options {
+        raw: true,
+        ..fields(&["header.sec"])
+    };
+    let reason = "Invalid field 'header.sec': 'bytes' object has no attribute 'header'";
+    assert_eq!(echo(raw).unwrap_err().0, reason);
     for path in ["", ".", "..", "a[", "a[x]", "a[0"] {
         let refused = path.parse::<FieldPath>().unwrap_err();
         assert_eq!(refused.0, format!("Invalid field value '{path}'"));

@@ -41,6 +41,18 @@ impl Intervals {
         }
     }
 
+    /// Returns the time at which a message counts if messages up to `settled` were counted. A
+    /// message in shared memory may be seen after a later one of another writer: it then counts at
+    /// the time of that one. If the newest message is later than `settled`, the clock was set back.
+    #[must_use]
+    pub fn time_in_order(&self, time: i64, settled: i64) -> i64 {
+        if self.first.is_some() && self.newest <= settled {
+            time.max(self.newest)
+        } else {
+            time
+        }
+    }
+
     /// Adds a message. The first message begins the measurement. A message earlier than the first
     /// restarts it, since the clock was set back.
     pub fn add_message(&mut self, time: i64) {

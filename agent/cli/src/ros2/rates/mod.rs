@@ -28,9 +28,11 @@ const SECOND: i64 = 1_000_000_000;
 const NANOSECOND: f64 = 1e-9;
 /// Clears a terminal, as `--all` does before each table.
 const CLEAR_SCREEN: &str = "\x1b[H\x1b[2J\n";
-/// Maximum step of the clock. A larger step means that the clock was set, and skipped seconds are
-/// not reported.
+/// Maximum step of the clock of a capture, which may have gaps. A larger step means that the clock
+/// was set, and skipped seconds are not reported.
 const LONGEST_JUMP: i64 = 3600 * SECOND;
+/// Maximum step of the clock of a live agent, which ticks ten times a second.
+const LONGEST_LIVE_JUMP: i64 = 2 * SECOND;
 /// Maximum number of messages that wait for the clock, which ticks ten times a second.
 const MAX_WAITING: usize = 65_536;
 
@@ -56,12 +58,16 @@ pub struct Rates {
     places: HashMap<String, usize>,
     /// Messages after the last tick of the clock, with the indices of their topics.
     waiting: Vec<(Arrival, usize)>,
+    /// Time up to which messages have been counted.
+    settled: i64,
     /// Sequence numbers of each writer.
     numbers: HashMap<String, Numbers>,
     /// Topics that were reported as sampled.
     sampled_reported: HashSet<String>,
     /// Time of the next periodic report.
     next: Option<i64>,
+    /// Maximum step of the clock.
+    longest_jump: i64,
     output: Output,
 }
 
@@ -150,6 +156,15 @@ impl Rates {
         Self::empty(quantity, dialect, window, true)
     }
 
+    /// Measures a live agent instead of a capture.
+    #[must_use]
+    pub fn live(self) -> Self {
+        Self {
+            longest_jump: LONGEST_LIVE_JUMP,
+            ..self
+        }
+    }
+
     fn empty(quantity: Quantity, dialect: Dialect, window: usize, all: bool) -> Self {
         Self {
             quantity,
@@ -159,9 +174,11 @@ impl Rates {
             topics: Vec::new(),
             places: HashMap::new(),
             waiting: Vec::new(),
+            settled: i64::MIN,
             numbers: HashMap::new(),
             sampled_reported: HashSet::new(),
             next: None,
+            longest_jump: LONGEST_JUMP,
             output: Output::default(),
         }
     }
@@ -274,7 +291,7 @@ impl Rates {
             return Err(End::Refused(Refused("msg does not have header".to_owned())));
         }
         if self.waiting.len() >= MAX_WAITING {
-            self.settle(arrival.time);
+            self.settle(arrival.time.max(self.settled));
         }
         self.waiting.push((arrival, place));
         Ok(())
@@ -365,17 +382,20 @@ impl Rates {
         self.settle(i64::MAX);
     }
 
-    /// Counts the messages up to this time in the order of their times.
+    /// Counts the messages up to this time in the order of their times. An earlier time than that
+    /// of the last call means that the clock was set back.
     fn settle(&mut self, until: i64) {
+        self.settled = self.settled.min(until);
         self.waiting.sort_by_key(|(arrival, _)| arrival.time);
         let passed = self
             .waiting
             .partition_point(|(arrival, _)| arrival.time <= until);
         let later = self.waiting.split_off(passed);
         for (arrival, place) in mem::replace(&mut self.waiting, later) {
-            self.tick(arrival.time);
+            self.tick(arrival.time.max(self.settled));
             self.count(&arrival, place);
         }
+        self.settled = until;
     }
 
     fn count(&mut self, arrival: &Arrival, place: usize) {
@@ -386,7 +406,7 @@ impl Rates {
             .map(|watched| &mut watched.series)
         {
             Some(Series::Rate(intervals)) => {
-                intervals.add_message(arrival.time);
+                intervals.add_message(intervals.time_in_order(arrival.time, self.settled));
                 if reported_at_message && let Some(rate) = intervals.report_at_message() {
                     self.output.out.push_str(&rate.lines());
                 }
@@ -413,7 +433,7 @@ impl Rates {
             }
             // The clock was set back or far ahead, so the seconds are counted from `now`.
             Some(next) if next.saturating_sub(now) > 2 * SECOND => now.saturating_add(SECOND),
-            Some(next) if now.saturating_sub(next) > LONGEST_JUMP => now,
+            Some(next) if now.saturating_sub(next) > self.longest_jump => now,
             Some(next) => next,
         };
         let mut due = next;

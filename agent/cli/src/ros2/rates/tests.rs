@@ -374,6 +374,51 @@ fn a_sampled_rate_is_correct_in_the_first_report_despite_late_polls() {
 }
 
 #[test]
+fn a_late_message_of_a_second_writer_causes_no_negative_interval() {
+    for dialect in [Dialect::Jazzy, Dialect::Kilted] {
+        let mut rates = Rates::of(Quantity::Rate, dialect, 10_000, named(&["/imu"]));
+        rates.opened(&present(&[("/imu", IMU)])).unwrap();
+        rates.clock(at(0));
+        for step in 0..40 {
+            let begin = 100 * step;
+            for (writer, sent, read) in [("01", 60, 65), ("02", 40, 95)] {
+                let arrival = Arrival {
+                    time: at(begin + read),
+                    size: 100,
+                    header_stamp: None,
+                };
+                let origin = Origin {
+                    writer,
+                    number: u64::try_from(step + 1).unwrap(),
+                    source_timestamp: Some(at(begin + sent)),
+                    is_sampled: true,
+                };
+                rates.arrived_from("/imu", arrival, origin).unwrap();
+                rates.clock(at(begin + read));
+            }
+        }
+        let text = rates.take().out;
+        let reports = text.matches("average rate: ").count();
+        let in_order = text.matches("\tmin: 0.000s max: 0.100s ").count();
+        assert!(reports >= 2 && in_order == reports, "{text}");
+    }
+}
+
+#[test]
+fn a_clock_step_of_minutes_causes_one_report_of_a_live_agent() {
+    let reports = |is_live: bool| {
+        let rates = Rates::of(Quantity::Bandwidth, Dialect::Humble, 100, named(&["/imu"]));
+        let mut rates = if is_live { rates.live() } else { rates };
+        rates.opened(&present(&[("/imu", IMU)])).unwrap();
+        rates.clock(at(0));
+        messages(&mut rates, "/imu", [100, 200]);
+        rates.clock(at(300_000));
+        rates.take().out.matches(" from 2 messages").count()
+    };
+    assert_eq!((reports(true), reports(false)), (1, 300));
+}
+
+#[test]
 fn a_clock_step_forward_causes_one_report_and_a_step_back_a_warning() {
     let mut rates = Rates::of(Quantity::Bandwidth, Dialect::Humble, 100, named(&["/imu"]));
     rates.opened(&present(&[("/imu", IMU)])).unwrap();

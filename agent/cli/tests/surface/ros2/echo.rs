@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use ros2probe_message::MessageType;
+use ros2probe_testing::local_agent::LocalAgent;
 use ros2probe_testing::model::capture::{Capture, ETHERNET};
 use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS};
 use ros2probe_testing::type_description::{Response, described, field};
@@ -10,6 +11,7 @@ use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 use serde::Deserialize;
 
 use super::{fails_with, run, stderr, stdout};
+use crate::rp;
 
 #[derive(Deserialize)]
 struct Recorded {
@@ -155,10 +157,7 @@ fn a_topic_that_cannot_be_echoed_is_reported_in_one_line() {
         &ask(&["--filter", "m.x > 1"]),
         "'Imu' object has no attribute 'x'",
     );
-    fails_with(
-        &ask(&["sensor_msgs/Imu"]),
-        "The passed message type is invalid",
-    );
+    fails_with(&ask(&["Imu"]), "The passed message type is invalid");
     fails_with(
         &ask(&["no_msgs/msg/None"]),
         "no definition of no_msgs/msg/None",
@@ -176,6 +175,88 @@ fn a_topic_that_cannot_be_echoed_is_reported_in_one_line() {
         "{}",
         stderr(&other)
     );
+}
+
+/// Service events are not in this capture: only the type is checked.
+#[test]
+fn a_type_without_its_kind_is_that_of_the_command() {
+    let once = ["topic", "echo", IMU, "--once"];
+    let full = echo(&[&once[..], &["sensor_msgs/msg/Imu"]].concat(), START, END);
+    let short = echo(&[&once[..], &["sensor_msgs/Imu"]].concat(), START, END);
+    assert!(stdout(&full).starts_with("header:\n"), "{}", stderr(&full));
+    assert_eq!(short, full);
+
+    let capture = Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("../testing/data/cyclonedds/lifecycle-2ns/capture.pcap.gz");
+    let replay = ["--csv", "--replay", capture.to_str().unwrap()];
+    for (command, name, package, kind, type_name) in [
+        (
+            "action",
+            "fibonacci",
+            "example_interfaces",
+            "action",
+            "Fibonacci",
+        ),
+        (
+            "service",
+            "add_two_ints",
+            "example_interfaces",
+            "srv",
+            "AddTwoInts",
+        ),
+    ] {
+        let name = format!("/robot1/{name}");
+        let ask = |type_name: &str| {
+            let words = [command, "echo", &name, type_name];
+            run(&[&words[..], &replay].concat())
+        };
+        let full = ask(&format!("{package}/{kind}/{type_name}"));
+        assert_eq!(full.status.code(), Some(0), "{}", stderr(&full));
+        assert_eq!(ask(&format!("{package}/{type_name}")), full, "{command}");
+    }
+}
+
+#[test]
+fn a_type_that_is_no_service_or_action_is_refused() {
+    for (command, type_name) in [
+        ("service", "AddTwoInts"),
+        ("service", "std_msgs/msg/String"),
+        ("action", "example_interfaces/"),
+        ("action", "example_interfaces/srv/AddTwoInts"),
+    ] {
+        let output = run(&[
+            command,
+            "echo",
+            "/a",
+            type_name,
+            "--replay",
+            "/nowhere.pcap",
+        ]);
+        let reason = format!("The service type '{type_name}' is invalid");
+        fails_with(&output, &reason);
+    }
+}
+
+#[test]
+fn a_service_of_two_types_is_echoed_only_with_its_type() {
+    let capture = super::graph::own().join("mixed.pcap.gz");
+    let mut agent = LocalAgent::replay(&mut rp(), &capture, &["--speed", "max"]);
+    agent.wait_for_log("the capture has ended");
+    let host = agent.api.to_string();
+    let ask = |words: &[&str]| {
+        let command = ["service", "echo", "--host", &host];
+        run(&[&command[..], words].concat())
+    };
+    fails_with(
+        &ask(&["/mixed/serve"]),
+        "More than one type associated with service '/mixed/serve'",
+    );
+    fails_with(&ask(&["/nope"]), "Cannot find type for '/nope'");
+    // The name is printed as it was typed.
+    let silent = ask(&["mixed/serve", "std_srvs/srv/Trigger"]);
+    let begin = "No publishers on topic 'mixed/serve/_service_event'; is service introspection";
+    let printed = stdout(&silent);
+    assert!(printed.starts_with(begin), "{printed}{}", stderr(&silent));
 }
 
 #[test]
@@ -348,6 +429,18 @@ fn a_type_without_an_installed_package_is_echoed_after_another_participant_reque
     assert!(number.starts_with("id: "), "{text}{}", stderr(&echoed));
     let expected = "mode: 1\nticks:\n- 1\n- 2\ntable:\n- 1\n- 2\n- 3\n- 4\n- 5\n- 6\n---\n";
     assert_eq!(rest, expected);
+}
+
+#[test]
+fn messages_of_a_type_that_only_the_agent_knows_are_filtered() {
+    let capture = Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("../testing/data/cyclonedds11/type-lookup.pcap.gz");
+    let capture = capture.to_str().unwrap();
+    let filter = ["--filter", "m.ok", "--replay", capture];
+    let measured = run(&[&["topic", "hz", "/things"][..], &filter].concat());
+    let text = stdout(&measured);
+    assert!(text.contains("average rate: 4.98"), "{text}");
+    assert_eq!(stderr(&measured), "", "{text}");
 }
 
 #[test]

@@ -130,6 +130,25 @@ fn the_nodes_of_an_action_have_their_full_names() {
 }
 
 #[test]
+fn action_info_finds_a_relative_name_and_refuses_an_invalid_one() {
+    let capture = own().join("graph.pcap.gz");
+    let ask = |name: &str| {
+        let replay = ["--replay", capture.to_str().unwrap()];
+        run(&[&["action", "info", "-c", name][..], &replay].concat())
+    };
+    let found = "Action: robot1/fibonacci\nAction clients: 1\nAction servers: 1\n";
+    let relative = ask("robot1/fibonacci");
+    assert_eq!(stdout(&relative), found, "{}", stderr(&relative));
+    let invalid = ask("/robot1//fibonacci");
+    let reason = "Invalid topic name: topic name must not contain repeated '/':\n";
+    assert!(stderr(&invalid).starts_with(reason), "{}", stderr(&invalid));
+    assert_eq!(
+        (stdout(&invalid).as_str(), invalid.status.code()),
+        ("", Some(1))
+    );
+}
+
+#[test]
 fn commands_missing_in_humble_print_the_output_of_jazzy() {
     let capture = own().join("graph.pcap.gz");
     let ask = |words: &str| {

@@ -7,6 +7,9 @@ use std::io::Read as _;
 use std::path::{Path, PathBuf};
 
 use flate2::read::MultiGzDecoder;
+use ros2probe_testing::model::capture::{Capture, ETHERNET, writer};
+use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS};
+use ros2probe_wire::GuidPrefix;
 use serde_json::Value;
 
 use super::{run, stderr, stdout};
@@ -129,6 +132,38 @@ fn received_messages_of_a_lossy_topic_are_counted() {
     let repeated = "fastrtps-udp/points-reliable-2ns/capture.pcap.gz";
     let printed = on(repeated, "hz /robot1/points --distro kilted");
     assert!(printed.ends_with("window: 9\n"), "{printed}");
+}
+
+/// The first message is sent nine seconds before the measurement, and kept by the agent.
+#[test]
+fn a_latched_message_that_was_sent_before_does_not_count() {
+    const START: u64 = 1_700_000_000_000_000_000;
+    const MILLISECOND: u64 = 1_000_000;
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("latched.pcap");
+    let participant = GuidPrefix([1, 0x10, 0, 0, 0, 0, 0, 0, 0, 0, 1, 1]);
+    let talker = writer(participant, 1);
+    let mut capture = Capture::new(ETHERNET);
+    capture.participant(START, 0, participant);
+    let transient_local = 1_u32.to_le_bytes();
+    let reliable = [2_u8, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0];
+    let qos = [(0x1d, &transient_local[..]), (0x1a, &reliable[..])];
+    let announced = "std_msgs::msg::dds_::String_";
+    let payload = forge::endpoint_with(talker, "rt/chatter", announced, &qos);
+    let message = Message::from(participant).data(SEDP_WRITERS, 1, &payload);
+    capture.put(START + MILLISECOND, 0, message);
+    capture.sample(START + 1_000 * MILLISECOND, 0, talker, 1);
+    for number in 2..24 {
+        let time = START + (10_000 + number * 100) * MILLISECOND;
+        capture.sample(time, 0, talker, number);
+    }
+    capture.write(&path);
+    let words = ["topic", "hz", "/chatter", "--distro", "kilted"];
+    let replay = ["--from", "1700000009.9", "--replay", path.to_str().unwrap()];
+    let output = run(&[&words[..], &["--filter", "m.data == 'hello'"], &replay].concat());
+    let printed = stdout(&output);
+    let expected = "min: 0.100s max: 0.100s std dev: 0.00000s window: 17\n";
+    assert!(printed.ends_with(expected), "{printed}{}", stderr(&output));
 }
 
 #[test]

@@ -87,6 +87,7 @@ fn changed(change: &snapshot::ParameterChange, clock: WallClock) -> api::Paramet
     let client = change.requested_by.as_ref();
     api::ParameterChange {
         timestamp_seconds: clock.wall_time(change.at).seconds(),
+        monotonic_ns: change.at.nanoseconds(),
         domain_id: change.domain_id.0,
         ros_node: Cow::Borrowed(&change.node),
         name: Cow::Borrowed(&change.name),

@@ -83,6 +83,9 @@ struct Wanted {
     domain_id: Option<u32>,
     /// Whether to send the payloads of the messages.
     payload: bool,
+    /// Whether `payload` first sends the last messages that the agent keeps of latched topics; by
+    /// default true.
+    latched: Option<bool>,
     /// Size of the queue for this client in bytes, at least 64 KiB; `limits.payload_bytes` bounds
     /// the queues of all streams together. A full queue drops the oldest message of the topic with
     /// the most bytes in the queue.
@@ -160,6 +163,7 @@ async fn samples(
             Overflow::DropOldest
         },
         is_clock_complete: depth == Depth::Payloads,
+        latched: wanted.latched.unwrap_or(true),
         label: "GET /samples".to_owned(),
     };
     let opened = context.subscriptions.open(request);

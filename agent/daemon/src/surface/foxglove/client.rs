@@ -375,6 +375,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
                 // A viewer must not delay a replay.
                 overflow: Overflow::DropOldest,
                 is_clock_complete: false,
+                latched: true,
                 label: "foxglove".to_owned(),
             });
         match opened {

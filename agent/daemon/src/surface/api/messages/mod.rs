@@ -221,6 +221,7 @@ fn request(domain_id: DomainId, dds_name: &DdsName) -> Request {
         // A slow client must not delay the agent, nor a replay.
         overflow: Overflow::DropOldest,
         is_clock_complete: false,
+        latched: true,
         label: "GET /topics/{topic}/messages".to_owned(),
     }
 }
