@@ -13,7 +13,7 @@ use tokio::task::{spawn_blocking, yield_now};
 use crate::bags::{Bag, Fingerprint};
 use crate::manifest::{self, Manifest};
 use crate::shipper::Shipper;
-use crate::state::{Delivery, FileDelivery, Upload};
+use crate::state::{Delivery, Destination, FileDelivery, Upload};
 use crate::store::{Store, StoreError};
 
 /// Size of a part in bytes. A smaller file is sent at once.
@@ -82,20 +82,26 @@ impl Shipper {
         if delivery.remote.is_none() && self.choose_name(bag, &mut delivery).await? {
             return self.finish(bag, delivery);
         }
-        for index in 0..delivery.files.len() {
-            while delivery
-                .files
-                .get(index)
-                .is_some_and(|file| !file.is_delivered)
-            {
-                if self.is_interrupted(bag) {
-                    return Ok(Step::Interrupted);
+        // All sizes are compared at the end: the destination may lose files during a long delivery.
+        let goals: [fn(&FileDelivery) -> bool; 2] = [|file| file.is_sent, |file| file.is_delivered];
+        for is_reached in goals {
+            for index in 0..delivery.files.len() {
+                while delivery
+                    .files
+                    .get(index)
+                    .is_some_and(|file| !is_reached(file))
+                {
+                    if self.is_interrupted(bag) {
+                        delivery.forget_sizes();
+                        self.records.keep(&bag.name, delivery);
+                        return Ok(Step::Interrupted);
+                    }
+                    self.store()?.reload_credentials()?;
+                    let sent = self.send(bag, &mut delivery, index).await;
+                    self.records.keep(&bag.name, delivery.clone());
+                    sent?;
+                    self.show_progress(bag, &delivery);
                 }
-                self.store()?.reload_credentials()?;
-                let sent = self.send(bag, &mut delivery, index).await;
-                self.records.keep(&bag.name, delivery.clone());
-                sent?;
-                self.show_progress(bag, &delivery);
             }
         }
         if Fingerprint::of(&bag.path).ok().as_ref() != Some(&bag.fingerprint) {
@@ -117,10 +123,12 @@ impl Shipper {
         self.finish(bag, delivery)
     }
 
-    /// Returns the record of a bag, or a new one. A record of another bag of this name is dropped.
+    /// Returns the record of a bag, or a new one. A record of another bag of this name, or of
+    /// another destination, is dropped.
     async fn recorded(&mut self, bag: &Bag) -> Result<Delivery, DeliveryError> {
         if let Some(delivery) = self.records.get(&bag.name) {
-            if delivery.fingerprint == bag.fingerprint {
+            if delivery.fingerprint == bag.fingerprint && delivery.destination == self.destination()
+            {
                 return Ok(delivery.clone());
             }
             self.drop_record(&bag.name).await?;
@@ -132,6 +140,7 @@ impl Shipper {
             ..FileDelivery::default()
         });
         Ok(Delivery {
+            destination: self.destination(),
             fingerprint: bag.fingerprint.clone(),
             is_complete: bag.content.is_complete,
             files: files.collect(),
@@ -144,6 +153,10 @@ impl Shipper {
         let Some(delivery) = self.records.forget(name) else {
             return Ok(());
         };
+        // The uploads of another destination are unknown to this one.
+        if delivery.destination != self.destination() {
+            return Ok(());
+        }
         for file in delivery.files.iter().filter(|file| !file.is_delivered) {
             if let Some(upload) = &file.upload {
                 let path = self.path(&delivery, &file.name);
@@ -263,6 +276,14 @@ impl Shipper {
         }
         self.records.keep(&bag.name, delivery);
         Ok(Step::Delivered)
+    }
+
+    fn destination(&self) -> Destination {
+        Destination {
+            url: self.settings.url.clone(),
+            endpoint: self.settings.endpoint.clone(),
+            instance: self.settings.instance.clone(),
+        }
     }
 
     /// Returns the path of a file of a bag at the destination.

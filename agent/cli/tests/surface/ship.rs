@@ -336,6 +336,54 @@ fn a_bag_arrives_in_a_folder_with_its_manifest() {
     assert!(robot.bag("drive").exists());
 }
 
+/// Begins the delivery of a bag to a folder, and kills the process after the first file.
+fn begin_delivery(folder: &Path) -> Robot {
+    let robot = Robot::to(&format!("file://{}", folder.display()), "");
+    robot.configure("  max_bytes_per_second: 2000000\n", "");
+    robot.record("drive", MIB, 100);
+    fs::write(robot.bag("drive").join("notes.bin"), vec![7; 8 * MIB]).unwrap();
+    age(&robot.bag("drive"), 100);
+    let running = robot.start();
+    robot.wait_for("first file", |status| {
+        let done = status["uploading"]["done_bytes"].as_u64();
+        done.is_some_and(|done| done >= MIB as u64)
+    });
+    running.kill();
+    robot.configure("", "");
+    let delivered = files(&folder.join("robot-17/drive"));
+    assert!(delivered.contains_key("drive_0.mcap"));
+    assert!(!delivered.contains_key("manifest.json"));
+    robot
+}
+
+#[test]
+fn a_bag_is_whole_at_the_destination_that_was_configured_in_the_middle() {
+    let first = tempfile::tempdir().unwrap();
+    let mut robot = begin_delivery(first.path());
+    let second = tempfile::tempdir().unwrap();
+    robot.url = format!("file://{}", second.path().display());
+    robot.configure("", "");
+    robot.delivers();
+    let delivered = files(&second.path().join("robot-17/drive"));
+    assert_whole(&files(&robot.bag("drive")), delivered);
+    // A delivered bag is not sent to the next one.
+    let third = tempfile::tempdir().unwrap();
+    robot.url = format!("file://{}", third.path().display());
+    robot.configure("", "");
+    robot.delivers();
+    assert!(!third.path().join("robot-17").exists());
+}
+
+#[test]
+fn a_bag_is_whole_after_the_destination_lost_its_first_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let robot = begin_delivery(folder.path());
+    let delivered = folder.path().join("robot-17/drive");
+    fs::remove_dir_all(&delivered).unwrap();
+    robot.delivers();
+    assert_whole(&files(&robot.bag("drive")), files(&delivered));
+}
+
 #[test]
 fn a_missing_folder_is_not_created() {
     let folder = tempfile::tempdir().unwrap();
