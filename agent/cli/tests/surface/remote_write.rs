@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
 use ros2probe_metrics::catalogue::{CATALOGUE, Kind};
@@ -188,6 +189,25 @@ fn samples_refused_temporarily_are_sent_later_in_order_and_once() {
     let delivered = receiver.stored().iter().map(Write::samples).sum::<usize>();
     agent.wait_for_metric(&samples("delivered"), |count| count >= delivered as f64);
     agent.wait_for_metric(&samples("overflow"), |count| count < 0.5);
+}
+
+#[test]
+fn a_receiver_that_demands_no_pause_gets_growing_pauses() {
+    let directory = tempfile::tempdir().unwrap();
+    let requests = Arc::new(AtomicUsize::new(0));
+    let counted = Arc::clone(&requests);
+    let receiver = Receiver::start(move |_| {
+        counted.fetch_add(1, Ordering::Relaxed);
+        Reply {
+            headers: vec![("Retry-After", "0".to_owned())],
+            ..Reply::status(503)
+        }
+    });
+    let mut agent = sending(&receiver, directory.path(), "");
+    agent.wait_for_log("out of reach");
+    std::thread::sleep(Duration::from_secs(5));
+    let requests = requests.load(Ordering::Relaxed);
+    assert!((2..=4).contains(&requests), "{requests}");
 }
 
 #[test]

@@ -316,7 +316,8 @@ impl Sender<'_> {
                 WriteResult::RetryLater(reason, demanded) => {
                     figures.count_request(Request::Retried, length);
                     self.failed(&reason);
-                    sleep(demanded.unwrap_or(pause)).await;
+                    // A receiver can demand a longer pause, but no shorter one.
+                    sleep(pause.max(demanded.unwrap_or_default())).await;
                     pause = (pause * 2).min(LONGEST_PAUSE);
                 }
             }
