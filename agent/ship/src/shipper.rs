@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::fs;
 use std::io;
-use std::path::PathBuf;
+use std::path::{Path as FilePath, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -12,7 +12,7 @@ use object_store::path::Path;
 use serde_json::Value;
 use tokio::time::sleep;
 
-use crate::bags::{Bag, Found, Scanner};
+use crate::bags::{Bag, Fingerprint, Found, Scanner};
 use crate::delivery::{DeliveryError, Step};
 use crate::settings::{Settings, SettingsError, destination};
 use crate::space;
@@ -290,9 +290,10 @@ impl Shipper {
         while space::is_needed(&self.settings.recordings, self.settings.space) {
             let is_delivered = |bag: &&Bag| {
                 let record = self.records.get(&bag.name);
-                record.is_some_and(|record| {
+                let is_delivered = record.is_some_and(|record| {
                     record.is_delivered && record.fingerprint == bag.fingerprint
-                })
+                });
+                is_delivered && !self.aside(&bag.name).exists()
             };
             let bags = self.found.bags.iter().filter(is_delivered);
             let Some(bag) = bags.min_by_key(|bag| bag.began()).cloned() else {
@@ -315,21 +316,36 @@ impl Shipper {
                     return;
                 }
             }
-            let aside = self
-                .settings
-                .recordings
-                .join(format!("{DELETED_PREFIX}{}", bag.name));
-            // After a loss of power, a bag is there as a whole or not at all.
-            let removed = fs::rename(&bag.path, &aside).and_then(|()| fs::remove_dir_all(&aside));
-            if let Err(error) = removed {
-                tracing::warn!(bag = %bag.name, %error, "failed to delete a delivered bag");
+            // The bag may have changed during the requests.
+            if Fingerprint::of(&bag.path).ok().as_ref() != Some(&bag.fingerprint) {
                 return;
             }
-            tracing::info!(bag = %bag.name, "deleted a delivered bag for space");
+            let aside = self.aside(&bag.name);
+            // After a loss of power, all files of a bag are there, or none.
+            let removed = fs::rename(&bag.path, &aside)
+                .and_then(|()| remove_files(&aside, &bag.path, &bag.fingerprint));
+            match removed {
+                Ok(Removal::Whole) => {
+                    tracing::info!(bag = %bag.name, "deleted a delivered bag for space");
+                }
+                Ok(Removal::Files) => {
+                    tracing::warn!(bag = %bag.name, "deleted the files of a delivered bag for space: other entries of it stay");
+                }
+                Err(error) => {
+                    tracing::warn!(bag = %bag.name, %error, "failed to delete a delivered bag");
+                    return;
+                }
+            }
             self.status.deleted_bags += 1;
             self.records.forget(&bag.name);
             self.found.bags.retain(|other| other.name != bag.name);
         }
+    }
+
+    /// Returns the path of a bag that is being deleted.
+    fn aside(&self, bag: &str) -> PathBuf {
+        let name = format!("{DELETED_PREFIX}{bag}");
+        self.settings.recordings.join(name)
     }
 
     /// Removes the rest of bags whose deletion was interrupted.
@@ -338,12 +354,17 @@ impl Shipper {
             .into_iter()
             .flatten();
         for entry in entries.flatten() {
-            if entry
-                .file_name()
-                .to_string_lossy()
-                .starts_with(DELETED_PREFIX)
+            let name = entry.file_name();
+            let bag = name
+                .to_str()
+                .and_then(|name| name.strip_prefix(DELETED_PREFIX));
+            let aside = entry.path();
+            // Only the files of a delivered bag have such a path.
+            if let Some(bag) = bag
+                && entry.file_type().is_ok_and(|kind| kind.is_dir())
+                && let Ok(files) = Fingerprint::of(&aside)
             {
-                let _ = fs::remove_dir_all(entry.path());
+                let _ = remove_files(&aside, &self.settings.recordings.join(bag), &files);
             }
         }
     }
@@ -440,6 +461,33 @@ impl Shipper {
     }
 }
 
+/// What a deletion removed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Removal {
+    /// The directory of the bag.
+    Whole,
+    /// The files of the bag. Its directory has other entries, which were not delivered.
+    Files,
+}
+
+/// Removes the files of a bag, and its directory `aside`. A directory with other entries gets the
+/// path `bag` again.
+fn remove_files(aside: &FilePath, bag: &FilePath, files: &Fingerprint) -> io::Result<Removal> {
+    for (name, _) in files.files() {
+        match fs::remove_file(aside.join(name)) {
+            Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
+            _ => {}
+        }
+    }
+    match fs::remove_dir(aside) {
+        Err(error) if error.kind() == io::ErrorKind::DirectoryNotEmpty => {
+            fs::rename(aside, bag)?;
+            Ok(Removal::Files)
+        }
+        removed => removed.map(|()| Removal::Whole),
+    }
+}
+
 /// Makes a delivery begin again.
 fn restart_delivery(delivery: &mut Delivery) {
     delivery.is_delivered = false;
@@ -460,4 +508,38 @@ fn describe(error: &dyn std::error::Error) -> String {
         cause = deeper.source();
     }
     text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn names(directory: &FilePath) -> Vec<String> {
+        let entries = fs::read_dir(directory).unwrap();
+        let names = entries.map(|entry| entry.unwrap().file_name().into_string().unwrap());
+        let mut names: Vec<_> = names.collect();
+        names.sort();
+        names
+    }
+
+    #[test]
+    fn a_deletion_removes_the_delivered_files_and_keeps_other_entries() {
+        let directory = tempfile::tempdir().unwrap();
+        let (aside, bag) = (directory.path().join("aside"), directory.path().join("bag"));
+        fs::create_dir(&aside).unwrap();
+        fs::write(aside.join("0.mcap"), "1").unwrap();
+        let files = Fingerprint::of(&aside).unwrap();
+        // A file that is gone is no failure: an earlier deletion was interrupted.
+        fs::remove_file(aside.join("0.mcap")).unwrap();
+        let removed = remove_files(&aside, &bag, &files).unwrap();
+        assert_eq!(removed, Removal::Whole);
+        assert_eq!(names(directory.path()), [""; 0]);
+        fs::create_dir_all(aside.join("camera")).unwrap();
+        fs::write(aside.join("0.mcap"), "1").unwrap();
+        fs::write(aside.join("later.txt"), "2").unwrap();
+        let removed = remove_files(&aside, &bag, &files).unwrap();
+        assert_eq!(removed, Removal::Files);
+        assert_eq!(names(directory.path()), ["bag"]);
+        assert_eq!(names(&bag), ["camera", "later.txt"]);
+    }
 }

@@ -665,6 +665,28 @@ fn delivered_bags_are_deleted_only_if_space_is_needed_and_the_store_has_them() {
     assert!(robot.bag("new").exists());
 }
 
+#[test]
+fn a_deletion_for_space_keeps_what_was_not_delivered() {
+    let store = Store::start();
+    let robot = Robot::of(&store);
+    robot.record("drive", 90_000, 100);
+    robot.delivers();
+    // Only the plain files of a bag are delivered.
+    let camera = robot.bag("drive").join("camera");
+    fs::create_dir(&camera).unwrap();
+    fs::write(camera.join("left.yaml"), "width: 640").unwrap();
+    robot.configure("", ", max_total_bytes: 65536");
+    robot.delivers();
+    let left = fs::read_dir(robot.bag("drive")).unwrap().count();
+    assert_eq!(left, 1, "only the directory is left");
+    let text = fs::read_to_string(camera.join("left.yaml")).unwrap();
+    assert_eq!(text, "width: 640");
+    assert_eq!(robot.status()["deleted_bags"], 1);
+    robot.delivers();
+    assert_eq!(robot.status()["deleted_bags"], 1);
+    assert!(camera.join("left.yaml").exists());
+}
+
 /// The test needs root, for a disk of its own.
 #[test]
 fn bags_on_a_full_disk_are_delivered_and_deleted() {
