@@ -147,7 +147,8 @@ impl Shipper {
         }
     }
 
-    /// Delivers the finished bags once, without regard to windows.
+    /// Delivers the finished bags once, without regard to windows. Waits for bags that ended just
+    /// now.
     ///
     /// # Errors
     /// Fails if a bag waits after some attempts, or if the directory cannot be read.
@@ -157,10 +158,11 @@ impl Shipper {
         loop {
             let wait = self.deliver_step().await?;
             let waiting = self.waiting().len();
-            if waiting == 0 {
+            // A bag that ended just now is finished after a moment.
+            if waiting == 0 && !self.found.is_settling {
                 return Ok(self.status.clone());
             }
-            if self.failures_in_row >= MAX_FAILURES {
+            if waiting > 0 && self.failures_in_row >= MAX_FAILURES {
                 let failure = self.status.last_failure.clone().unwrap_or_default();
                 return Err(ShipError::Undelivered {
                     waiting,

@@ -385,6 +385,17 @@ fn a_bag_is_whole_after_the_destination_lost_its_first_file() {
 }
 
 #[test]
+fn one_pass_delivers_the_bag_that_ended_just_before() {
+    let store = Store::start();
+    let robot = Robot::of(&store);
+    let writer = robot.write("drive", 1000, 10, None);
+    writer.close(BTreeMap::new()).unwrap();
+    robot.delivers();
+    assert_stored(&store, &robot, "drive");
+    assert_eq!(robot.status()["unfinished_bags"], 0);
+}
+
+#[test]
 fn a_missing_folder_is_not_created() {
     let folder = tempfile::tempdir().unwrap();
     let missing = folder.path().join("not-mounted");
