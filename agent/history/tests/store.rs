@@ -325,6 +325,26 @@ fn a_file_that_was_cut_anywhere_keeps_its_whole_blocks_and_is_continued() {
     }
 }
 
+#[test]
+fn zeros_after_a_power_cut_are_no_blocks() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = filled(directory.path(), LIMIT, 1000..1003);
+    let (facts, state) = (store.facts(), store.state(60_180));
+    drop(store);
+    let file = files(directory.path()).remove(0);
+    let mut bytes = fs::read(&file).unwrap();
+    bytes.extend([0; 4096]);
+    fs::write(&file, bytes).unwrap();
+    let store = Store::open(directory.path(), LIMIT).unwrap();
+    assert_eq!(store.facts(), facts);
+    assert_eq!(rows(&store, 60_000..60_180, 1).len(), 180);
+    assert_eq!(store.state(60_180), state);
+    // The zeros are overwritten.
+    store.append(Tier::Seconds, &minute(60_180)).unwrap();
+    let store = Store::open(directory.path(), LIMIT).unwrap();
+    assert_eq!(rows(&store, 60_000..60_240, 1).len(), 240);
+}
+
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(300))]
 
