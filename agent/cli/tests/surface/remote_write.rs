@@ -393,6 +393,30 @@ fn a_receiver_that_demands_certificates_accepts_a_renewed_one() {
 }
 
 #[test]
+fn a_damaged_replaced_file_is_logged_once_and_stops_no_samples() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = |name: &str| directory.path().join(name);
+    make_certificate(directory.path());
+    let certificate = CertificateDer::from_pem_file(path("certificate")).unwrap();
+    let key = PrivateKeyDer::from_pem_file(path("key")).unwrap();
+    let config = ServerConfig::builder().with_no_client_auth();
+    let config = config.with_single_cert(vec![certificate], key).unwrap();
+    let receiver = Receiver::start_tls(config, Reply::stored);
+    std::fs::copy(path("authority"), path("robot.authority")).unwrap();
+    let more = format!(", ca_file: {}", path("robot.authority").display());
+    let url = format!("https://localhost:{}", receiver.address.port());
+    let mut agent = sending_to(&url, directory.path(), &more);
+    receiver.wait_for("samples", |stored| stored.len() > 1);
+    std::fs::write(path("robot.authority"), "no certificate").unwrap();
+    agent.wait_for_log("a replaced file of remote write cannot be used");
+    let before = receiver.stored().len();
+    receiver.wait_for("samples", |stored| stored.len() > before + 3);
+    let log = agent.log();
+    assert_eq!(log.matches("cannot be used").count(), 1, "{log}");
+    assert!(!log.contains("out of reach"), "{log}");
+}
+
+#[test]
 fn the_rate_of_bytes_is_limited() {
     let directory = tempfile::tempdir().unwrap();
     let receiver = Receiver::start(Reply::stored);
