@@ -22,6 +22,8 @@ use crate::store::Store;
 
 /// Time between two scans of the directory.
 const SCAN_INTERVAL: Duration = Duration::from_secs(2);
+/// Time after which a status is written again of which only times have changed.
+const STATUS_INTERVAL: Duration = Duration::from_mins(1);
 /// Pauses after a failure.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
 const LONGEST_PAUSE: Duration = Duration::from_mins(1);
@@ -48,6 +50,10 @@ pub struct Shipper {
     store: Option<Store>,
     scanner: Scanner,
     status: Status,
+    /// The status on disk, and when it was written.
+    written: Option<(Instant, Status)>,
+    /// Time of the next attempt to make space, after a failed one.
+    space_attempt: Option<Instant>,
     /// Failures that concern one bag, until its delivery. A bag with more of them waits behind
     /// others.
     failures: BTreeMap<String, u32>,
@@ -118,6 +124,8 @@ impl Shipper {
             observer,
             store: None,
             scanner: Scanner::default(),
+            written: None,
+            space_attempt: None,
             failures: BTreeMap::new(),
             failures_in_row: 0,
             logged: None,
@@ -289,13 +297,17 @@ impl Shipper {
     /// Deletes delivered bags while space is needed, the oldest first. Each is confirmed first.
     async fn make_space(&mut self) {
         self.remove_deleted();
+        if self.space_attempt.is_some_and(|at| at > Instant::now()) {
+            return;
+        }
         while space::is_needed(&self.settings.recordings, self.settings.space) {
             let is_delivered = |bag: &&Bag| {
                 let record = self.records.get(&bag.name);
                 let is_delivered = record.is_some_and(|record| {
                     record.is_delivered && record.fingerprint == bag.fingerprint
                 });
-                is_delivered && !self.aside(&bag.name).exists()
+                // Windows hold for the requests that confirm a bag.
+                is_delivered && self.is_permitted(bag) && !self.aside(&bag.name).exists()
             };
             let bags = self.found.bags.iter().filter(is_delivered);
             let Some(bag) = bags.min_by_key(|bag| bag.began()).cloned() else {
@@ -314,7 +326,8 @@ impl Shipper {
                     return;
                 }
                 Err(error) => {
-                    self.failed(&bag, &error).await;
+                    let pause = self.failed(&bag, &error).await;
+                    self.space_attempt = Some(Instant::now() + pause);
                     return;
                 }
             }
@@ -459,7 +472,12 @@ impl Shipper {
         self.status.waiting_bytes = bytes;
         self.status.unfinished_bags = self.found.unfinished.len() as u64;
         self.status.opens_in_seconds = self.time_to_window().as_secs();
-        self.status.write(&self.settings.state);
+        let is_written = self.written.as_ref().is_some_and(|(at, written)| {
+            at.elapsed() < STATUS_INTERVAL && written.is_same(&self.status)
+        });
+        if !is_written && self.status.write(&self.settings.state).is_ok() {
+            self.written = Some((Instant::now(), self.status.clone()));
+        }
     }
 }
 

@@ -228,7 +228,22 @@ pub(crate) fn write_json<T: Serialize>(path: &Path, value: &T) -> io::Result<()>
     write(path, &serde_json::to_vec_pretty(value)?)
 }
 
+/// Replaces a file of JSON. A loss of power may leave an empty one.
+pub(crate) fn write_json_unsynced<T: Serialize>(path: &Path, value: &T) -> io::Result<()> {
+    replace(path, &serde_json::to_vec_pretty(value)?, |_| Ok(()))
+}
+
 fn write(path: &Path, content: &[u8]) -> io::Result<()> {
+    replace(path, content, File::sync_all)?;
+    let directory = path.parent().unwrap_or(path);
+    File::open(directory)?.sync_all()
+}
+
+fn replace(
+    path: &Path,
+    content: &[u8],
+    finish: impl FnOnce(&File) -> io::Result<()>,
+) -> io::Result<()> {
     let mut part = path.as_os_str().to_owned();
     part.push(".part");
     let part = PathBuf::from(part);
@@ -237,10 +252,8 @@ fn write(path: &Path, content: &[u8]) -> io::Result<()> {
         options.write(true).create(true).truncate(true).mode(0o640);
         let mut file = options.open(&part)?;
         file.write_all(content)?;
-        file.sync_all()?;
-        fs::rename(&part, path)?;
-        let directory = path.parent().unwrap_or(path);
-        File::open(directory)?.sync_all()
+        finish(&file)?;
+        fs::rename(&part, path)
     };
     written().inspect_err(|_| {
         let _ = fs::remove_file(&part);

@@ -6,6 +6,8 @@ use std::fs::{self, File, FileTimes};
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Output, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant, SystemTime};
 
 use crate::rp;
@@ -674,6 +676,54 @@ fn delivered_bags_are_deleted_only_if_space_is_needed_and_the_store_has_them() {
     robot.record("new", 90_000, 10);
     assert_eq!(robot.once().status.code(), Some(1));
     assert!(robot.bag("new").exists());
+}
+
+#[test]
+fn a_deletion_for_space_keeps_to_pauses_and_windows() {
+    let store = Store::start();
+    let robot = Robot::of(&store);
+    robot.record("drive", 90_000, 100);
+    robot.delivers();
+    let requests = Arc::new(AtomicUsize::new(0));
+    let counted = Arc::clone(&requests);
+    store.decide(move |_| {
+        counted.fetch_add(1, Ordering::Relaxed);
+        RequestOutcome::Refuse(429, Some(60))
+    });
+    let passes = |ship: &str| {
+        robot.configure(ship, ", max_total_bytes: 65536");
+        let running = robot.start();
+        std::thread::sleep(Duration::from_secs(7));
+        running.end();
+        requests.swap(0, Ordering::Relaxed)
+    };
+    let now = jiff::Zoned::now();
+    let at = |hours: i64| {
+        let time = now.time().wrapping_add(jiff::Span::new().hours(hours));
+        time.strftime("%H:%M").to_string()
+    };
+    let closed = format!("  windows: ['{}-{}']\n", at(2), at(3));
+    assert_eq!(passes(&closed), 0);
+    assert_eq!(passes(""), 1);
+    assert!(robot.bag("drive").exists());
+}
+
+#[test]
+fn an_idle_service_does_not_write_its_status_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let robot = Robot::to(&format!("file://{}", folder.path().display()), "");
+    let running = robot.start();
+    robot.wait_for("status", |status| status["waiting_bags"] == 0);
+    let changed = || {
+        let about = fs::metadata(robot.path("state/ship/status.json"));
+        about.unwrap().modified().unwrap()
+    };
+    let before = changed();
+    std::thread::sleep(Duration::from_secs(5));
+    assert_eq!(changed(), before);
+    robot.record("drive", 1000, 100);
+    robot.wait_for("delivery", |status| status["delivered_bags"] == 1);
+    running.end();
 }
 
 #[test]
