@@ -13,7 +13,7 @@ use serde_json::Value;
 use tokio::time::sleep;
 
 use crate::bags::{Bag, Fingerprint, Found, Scanner};
-use crate::delivery::{DeliveryError, Step};
+use crate::delivery::{DeliveryError, PartialChecksum, Step};
 use crate::settings::{Settings, SettingsError, destination};
 use crate::space;
 use crate::state::{Delivery, Records, RecordsError};
@@ -46,6 +46,8 @@ pub struct Shipper {
     pub(crate) prefix: Path,
     pub(crate) records: Records,
     pub(crate) findings: Option<Findings>,
+    /// Checksum whose computation was interrupted.
+    pub(crate) partial_checksum: Option<PartialChecksum>,
     observer: Option<Observer>,
     store: Option<Store>,
     scanner: Scanner,
@@ -121,6 +123,7 @@ impl Shipper {
             status,
             prefix,
             findings,
+            partial_checksum: None,
             observer,
             store: None,
             scanner: Scanner::default(),
@@ -259,9 +262,11 @@ impl Shipper {
     /// Returns whether the delivery of a bag ends for now: the window closed, or a triggered bag
     /// waits behind one that is not.
     pub(crate) fn is_interrupted(&mut self, bag: &Bag) -> bool {
-        if !self.is_permitted(bag) {
-            return true;
-        }
+        !self.is_permitted(bag) || self.is_overtaken(bag)
+    }
+
+    /// Returns whether a triggered bag waits behind this one, which is not.
+    pub(crate) fn is_overtaken(&mut self, bag: &Bag) -> bool {
         let is_due = self
             .last_scan
             .is_none_or(|scan| scan.elapsed() >= SCAN_INTERVAL);
@@ -532,7 +537,81 @@ fn describe(error: &dyn std::error::Error) -> String {
 
 #[cfg(test)]
 mod tests {
+    use std::time::SystemTime;
+
+    use ros2probe_bag::{Options, Writer};
+    use sha2::{Digest as _, Sha256};
+
     use super::*;
+    use crate::manifest::Manifest;
+    use crate::settings::SpaceLimits;
+    use crate::windows::Windows;
+
+    /// Writes a bag that ended some time ago.
+    fn record(root: &FilePath, name: &str, options: Options) {
+        let bag = root.join(name);
+        let writer = Writer::create(&bag, options).unwrap();
+        writer.close(BTreeMap::new()).unwrap();
+        let then = SystemTime::now() - Duration::from_secs(60);
+        for entry in fs::read_dir(&bag).unwrap() {
+            let file = fs::File::open(entry.unwrap().path()).unwrap();
+            file.set_modified(then).unwrap();
+        }
+    }
+
+    #[tokio::test]
+    async fn a_triggered_bag_does_not_wait_for_the_checksums_of_another_one() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = |name: &str| directory.path().join(name);
+        for name in ["bags", "folder"] {
+            fs::create_dir(path(name)).unwrap();
+        }
+        let settings = Settings {
+            url: format!("file://{}", path("folder").display()),
+            endpoint: None,
+            region: None,
+            instance: "robot".to_owned(),
+            credentials_file: None,
+            ca_file: None,
+            max_bytes_per_second: None,
+            windows: Windows::default(),
+            triggered_always: false,
+            recordings: path("bags"),
+            state: path("state"),
+            space: SpaceLimits::default(),
+        };
+        let mut shipper = Shipper::new(settings, None, None).unwrap();
+        record(&path("bags"), "drive", Options::default());
+        shipper.scan().unwrap();
+        let drive = shipper.next().unwrap();
+        let mut options = Options::default();
+        let trigger = "{\"snapshot\":\"incident\"}".to_owned();
+        let key = "ros2probe_trigger".to_owned();
+        options.custom_data.insert(key, trigger);
+        record(&path("bags"), "incident", options);
+        shipper.last_scan = None;
+        let step = shipper.deliver(&drive).await.unwrap();
+        assert_eq!(step, Step::Interrupted);
+        assert_eq!(shipper.records.get("drive"), None, "no checksum is known");
+        let incident = shipper.next().unwrap();
+        assert_eq!(incident.name, "incident");
+        let step = shipper.deliver(&incident).await.unwrap();
+        assert_eq!(step, Step::Delivered);
+        assert!(
+            shipper.partial_checksum.is_some(),
+            "the other one continues"
+        );
+        let step = shipper.deliver(&drive).await.unwrap();
+        assert_eq!(step, Step::Delivered);
+        let text = fs::read(path("folder/robot/drive/manifest.json")).unwrap();
+        let manifest: Manifest = serde_json::from_slice(&text).unwrap();
+        for file in manifest.files {
+            let content = fs::read(path("bags/drive").join(&file.name)).unwrap();
+            let digest = Sha256::digest(&content);
+            let expected: String = digest.iter().map(|byte| format!("{byte:02x}")).collect();
+            assert_eq!(file.sha256, expected);
+        }
+    }
 
     fn names(directory: &FilePath) -> Vec<String> {
         let entries = fs::read_dir(directory).unwrap();

@@ -654,6 +654,33 @@ fn a_triggered_bag_overtakes_one_that_is_being_delivered() {
 }
 
 #[test]
+fn a_triggered_bag_overtakes_a_file_that_is_being_copied_into_a_folder() {
+    let folder = tempfile::tempdir().unwrap();
+    let robot = Robot::to(&format!("file://{}", folder.path().display()), "");
+    robot.configure("  max_bytes_per_second: 8000000\n", "");
+    robot.record("drive", 60 * MIB, 100);
+    let running = robot.start();
+    let delivered = folder.path().join("robot-17");
+    let wait_for = |path: &Path| {
+        let deadline = Instant::now() + PATIENCE;
+        while !path.exists() {
+            assert!(Instant::now() < deadline, "no {}", path.display());
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    };
+    wait_for(&delivered.join("drive"));
+    robot.snapshot("incident_1", 1000, 5);
+    wait_for(&delivered.join("incident_1/manifest.json"));
+    assert!(!delivered.join("drive/drive_0.mcap").exists());
+    running.kill();
+    robot.configure("", "");
+    robot.delivers();
+    for bag in ["drive", "incident_1"] {
+        assert_whole(&files(&robot.bag(bag)), files(&delivered.join(bag)));
+    }
+}
+
+#[test]
 fn delivered_bags_are_deleted_only_if_space_is_needed_and_the_store_has_them() {
     let store = Store::start();
     let robot = Robot::of(&store);
