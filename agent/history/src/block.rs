@@ -130,7 +130,9 @@ impl Header {
             begin: word(9)?,
             end: word(13)?,
         };
-        (header.stored <= MAX_STORED && header.begin <= header.end).then_some(header)
+        // A power cut may leave zeros, and no content is stored as nothing.
+        let is_possible = (1..=MAX_STORED).contains(&header.stored) && header.begin <= header.end;
+        is_possible.then_some(header)
     }
 
     /// Returns the block of this header and what is stored behind it; `None` if it is damaged.

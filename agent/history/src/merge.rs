@@ -4,16 +4,16 @@ use std::collections::BTreeMap;
 
 use crate::rows::{ProcessRow, TopicRow};
 
-/// A row that can be merged with a later one.
+/// A row that can be merged with another one.
 pub trait Merge: Copy {
     /// Returns the end of the row, as Unix time.
     fn end_time(&self) -> u32;
-    /// Extends this row by a later one.
-    fn extend(&mut self, later: &Self);
+    /// Extends this row by another one of the same step, which is usually later.
+    fn extend(&mut self, other: &Self);
 }
 
-/// Merges rows of one topic or process into steps that end at multiples of `step` seconds. A merged
-/// row has the time of its last row. Rows must be in the order of their times.
+/// Merges rows of one topic or process into steps that end at multiples of `step` seconds, in the
+/// order of their times. A merged row has the latest time of its rows.
 #[must_use]
 pub fn merged<R: Merge>(rows: &[R], step: u32) -> Vec<R> {
     let mut steps = Vec::new();
@@ -23,16 +23,23 @@ pub fn merged<R: Merge>(rows: &[R], step: u32) -> Vec<R> {
     steps
 }
 
-/// Appends the next row of a topic or process to its steps, as [`merged`] does.
+/// Adds a row of a topic or process to its steps, as [`merged`] does.
 pub fn merge_into<R: Merge>(steps: &mut Vec<R>, row: R, step: u32) {
-    let end = |row: &R| row.end_time().div_ceil(step.max(1));
-    match steps.last_mut() {
-        Some(last) if end(last) == end(&row) => last.extend(&row),
-        _ => steps.push(row),
+    let number = |row: &R| row.end_time().div_ceil(step.max(1));
+    let wanted = number(&row);
+    let is_latest = steps.last().is_none_or(|last| number(last) < wanted);
+    // A clock that was set back wrote earlier rows after later ones.
+    let place = match is_latest {
+        true => steps.len(),
+        false => steps.partition_point(|each| number(each) < wanted),
+    };
+    match steps.get_mut(place) {
+        Some(same) if number(same) == wanted => same.extend(&row),
+        _ => steps.insert(place, row),
     }
 }
 
-/// Adds the next row of one of several topics or processes, as [`merge_into`] does.
+/// Adds a row of one of several topics or processes, as [`merge_into`] does.
 pub fn merge_by_name<N: Ord + Clone, R: Merge>(
     all: &mut BTreeMap<N, Vec<R>>,
     name: &N,
@@ -52,15 +59,15 @@ impl Merge for TopicRow {
 
     /// Adds the counts. The medians become their mean, weighted by the messages; of the 99th
     /// percentiles the higher one stays.
-    fn extend(&mut self, later: &Self) {
-        let weights = [self.messages, later.messages];
-        self.latency = pair(self.latency, later.latency, weights);
-        self.interarrival = pair(self.interarrival, later.interarrival, weights);
-        self.at = later.at;
-        self.seconds = self.seconds.saturating_add(later.seconds);
-        self.messages = self.messages.saturating_add(later.messages);
-        self.lost = self.lost.saturating_add(later.lost);
-        self.bytes = self.bytes.saturating_add(later.bytes);
+    fn extend(&mut self, other: &Self) {
+        let weights = [self.messages, other.messages];
+        self.latency = pair(self.latency, other.latency, weights);
+        self.interarrival = pair(self.interarrival, other.interarrival, weights);
+        self.at = self.at.max(other.at);
+        self.seconds = self.seconds.saturating_add(other.seconds);
+        self.messages = self.messages.saturating_add(other.messages);
+        self.lost = self.lost.saturating_add(other.lost);
+        self.bytes = self.bytes.saturating_add(other.bytes);
     }
 }
 
@@ -69,11 +76,13 @@ impl Merge for ProcessRow {
         self.at
     }
 
-    fn extend(&mut self, later: &Self) {
-        self.at = later.at;
-        self.seconds = self.seconds.saturating_add(later.seconds);
-        self.cpu_ms = self.cpu_ms.saturating_add(later.cpu_ms);
-        self.memory_kib = later.memory_kib;
+    fn extend(&mut self, other: &Self) {
+        if other.at >= self.at {
+            self.memory_kib = other.memory_kib;
+        }
+        self.at = self.at.max(other.at);
+        self.seconds = self.seconds.saturating_add(other.seconds);
+        self.cpu_ms = self.cpu_ms.saturating_add(other.cpu_ms);
     }
 }
 
@@ -141,5 +150,32 @@ mod tests {
         };
         assert_eq!(merged(&rows, 60), [whole]);
         assert_eq!(merged(&rows, 0), rows);
+    }
+    #[test]
+    fn rows_in_the_order_of_a_clock_that_was_set_back_become_ascending_steps() {
+        let row = |at| TopicRow {
+            at,
+            seconds: 1,
+            messages: 1,
+            ..TopicRow::default()
+        };
+        let rows: Vec<_> = (1..=30).chain(51..=60).chain(16..=45).map(row).collect();
+        let steps = merged(&rows, 10);
+        let seen: Vec<_> = steps.iter().map(|step| (step.at, step.messages)).collect();
+        assert_eq!(
+            seen,
+            [(10, 10), (20, 15), (30, 20), (40, 10), (45, 5), (60, 10)]
+        );
+        let process = |at| ProcessRow {
+            at,
+            seconds: 1,
+            cpu_ms: 1,
+            memory_kib: at.into(),
+        };
+        let steps = merged(&[process(8), process(3)], 10);
+        assert_eq!(
+            (steps[0].at, steps[0].memory_kib, steps[0].cpu_ms),
+            (8, 8, 2)
+        );
     }
 }

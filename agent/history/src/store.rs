@@ -6,7 +6,6 @@ use std::io;
 use std::ops::Range;
 use std::os::unix::fs::DirBuilderExt as _;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use crate::block::{Block, Kind};
@@ -46,9 +45,6 @@ pub struct Store {
     /// Maximum size of all files, in bytes.
     limit: u64,
     tiers: Mutex<[Vec<Blocks>; 2]>,
-    /// Unix time of the last [`Self::condense`]. Blocks that end later are those of a clock that
-    /// was set back.
-    now: AtomicU32,
 }
 
 /// Times from which a tier has blocks.
@@ -128,7 +124,6 @@ impl Store {
             directory: directory.to_path_buf(),
             limit,
             tiers: Mutex::new(tiers),
-            now: AtomicU32::new(u32::MAX),
         })
     }
 
@@ -149,7 +144,10 @@ impl Store {
             Some(last)
                 if last.length < budget / FILES_PER_TIER
                     && begin.abs_diff(last.begin) < tier.span()
-                    && (tier == Tier::Seconds || first.begin >= last.end) =>
+                    && match tier {
+                        Tier::Seconds => !is_set_back(last.end, begin),
+                        Tier::Tens => first.begin >= last.end,
+                    } =>
             {
                 last
             }
@@ -192,13 +190,13 @@ impl Store {
     ///
     /// Fails if the blocks cannot be written.
     pub fn condense(&self, now: u32) -> io::Result<()> {
-        self.now.store(now, Ordering::Relaxed);
         for _ in 0..MAX_WINDOWS {
-            let Some(times) = self.next_window(now) else {
+            let files = self.latest_run();
+            let Some(times) = self.next_window(now, &files) else {
                 return Ok(());
             };
-            let topics = self.gathered(Kind::Topics, &times);
-            let processes = self.gathered(Kind::Processes, &times);
+            let topics = gathered(&files, Kind::Topics, &times);
+            let processes = gathered(&files, Kind::Processes, &times);
             let mut blocks = vec![Block::of_topics(times.start, times.end, &topics)];
             if !processes.is_empty() {
                 blocks.push(Block::of_processes(times.start, times.end, &processes));
@@ -208,7 +206,7 @@ impl Store {
                 .filter(|state| state.end > times.start);
             blocks.extend(state);
             let mut events = Vec::new();
-            self.visit(Tier::Seconds, Kind::Events, &times, &mut |block| {
+            visit(&files, Kind::Events, &times, &mut |block| {
                 events.push(block);
             });
             // A block that ends later belongs to the next window, because the latest end is the
@@ -231,7 +229,7 @@ impl Store {
         each: &mut dyn FnMut(&TopicName, TopicRow),
     ) {
         for (tier, times) in self.parts(times, step) {
-            self.rows(tier, Kind::Topics, &times, wanted, each);
+            rows(&self.files(tier), Kind::Topics, &times, wanted, each);
         }
     }
 
@@ -244,14 +242,14 @@ impl Store {
         each: &mut dyn FnMut(&ProcessName, ProcessRow),
     ) {
         for (tier, times) in self.parts(times, step) {
-            self.rows(tier, Kind::Processes, &times, wanted, each);
+            rows(&self.files(tier), Kind::Processes, &times, wanted, each);
         }
     }
 
     /// Visits the content of the blocks of events that overlap the times, the oldest first.
     pub fn events(&self, times: Range<u32>, each: &mut dyn FnMut(&[u8])) {
         for (tier, times) in self.parts(times, TEN_SECONDS) {
-            self.visit(tier, Kind::Events, &times, &mut |block| {
+            visit(&self.files(tier), Kind::Events, &times, &mut |block| {
                 each(&block.content);
             });
         }
@@ -302,35 +300,13 @@ impl Store {
         self.lock().get(tier as usize).cloned().unwrap_or_default()
     }
 
-    fn visit(&self, tier: Tier, kind: Kind, times: &Range<u32>, each: &mut dyn FnMut(Block)) {
-        for file in self.files(tier) {
-            if file.overlaps(times) {
-                file.visit(kind, times, each);
-            }
-        }
-    }
-
-    fn rows<N: Name, R: Row + Merge>(
-        &self,
-        tier: Tier,
-        kind: Kind,
-        times: &Range<u32>,
-        wanted: &dyn Fn(&N) -> bool,
-        each: &mut dyn FnMut(&N, R),
-    ) {
-        self.visit(tier, kind, times, &mut |block| {
-            columns::read(&block.content, wanted, &mut |name, row: R| {
-                if row.end_time() > times.start && row.end_time() <= times.end {
-                    each(name, row);
-                }
-            });
-        });
-    }
-
     /// Returns which tier has which part of the times.
     fn parts(&self, times: Range<u32>, step: u32) -> [(Tier, Range<u32>); 2] {
         let border = if step >= TEN_SECONDS {
-            self.condensed(self.now.load(Ordering::Relaxed))
+            let files = self.latest_run();
+            let begin = files.iter().map(|file| file.begin).min();
+            let done = self.condensed(&files).or(begin);
+            done.unwrap_or(u32::MAX)
         } else {
             let files = self.files(Tier::Seconds);
             files.iter().map(|file| file.begin).min().unwrap_or(0)
@@ -340,40 +316,38 @@ impl Store {
         [(Tier::Tens, older), (Tier::Seconds, newer)]
     }
 
-    /// Returns the time up to which [`Tier::Tens`] has blocks at the time `now`. Later blocks are
-    /// those of a clock that was set back.
-    fn condensed(&self, now: u32) -> u32 {
-        let files = self.files(Tier::Tens);
-        let past = files.iter().filter(|file| file.end <= now);
-        past.map(|file| file.end).max().unwrap_or(0)
+    /// Returns the files of [`Tier::Seconds`] since the clock was set back last.
+    fn latest_run(&self) -> Vec<Blocks> {
+        let mut files = self.files(Tier::Seconds);
+        let ends = files.iter().map(|file| file.end);
+        let begins = files.iter().skip(1).map(|file| file.begin);
+        let is_step = ends.zip(begins).map(|(end, begin)| is_set_back(end, begin));
+        let steps: Vec<bool> = is_step.collect();
+        let before = steps.iter().rposition(|is_step| *is_step);
+        files.drain(..before.map_or(0, |place| place + 1));
+        files
     }
 
-    /// Returns the next ten minutes for [`Tier::Tens`] that [`Tier::Seconds`] has whole.
-    fn next_window(&self, now: u32) -> Option<Range<u32>> {
+    /// Returns the time up to which [`Tier::Tens`] has the rows of the latest run of files; `None`
+    /// if it has none of them.
+    fn condensed(&self, run: &[Blocks]) -> Option<u32> {
+        let end = run.iter().map(|file| file.end).max()?;
+        let done = self.files(Tier::Tens).last()?.end;
+        // A later time is that of a run before the clock was set back.
+        (done < end.saturating_add(WINDOW_SECONDS)).then_some(done)
+    }
+
+    /// Returns the next ten minutes for [`Tier::Tens`] that the latest run of files has whole.
+    fn next_window(&self, now: u32, run: &[Blocks]) -> Option<Range<u32>> {
         let whole = now / WINDOW_SECONDS * WINDOW_SECONDS;
-        let done = self.condensed(now);
-        let files = self.files(Tier::Seconds);
+        let done = self.condensed(run).unwrap_or(0);
         // A time without observation has no files, and is skipped.
-        let left = files
+        let left = run
             .iter()
             .filter(|file| file.begin < whole && file.end > done);
         let begin = left.map(|file| file.begin.max(done)).min()? / WINDOW_SECONDS * WINDOW_SECONDS;
         let begin = begin.max(done);
         (begin < whole).then(|| begin..(begin / WINDOW_SECONDS + 1) * WINDOW_SECONDS)
-    }
-
-    /// Returns the merged rows of all topics or processes.
-    fn gathered<N: Name + Ord + Clone, R: Row + Merge>(
-        &self,
-        kind: Kind,
-        times: &Range<u32>,
-    ) -> Vec<Series<N, R>> {
-        let mut all = BTreeMap::<N, Vec<R>>::new();
-        self.rows(Tier::Seconds, kind, times, &|_| true, &mut |name, row| {
-            merge_by_name(&mut all, name, row, TEN_SECONDS);
-        });
-        let series = all.into_iter();
-        series.map(|(of, rows)| Series { of, rows }).collect()
     }
 
     /// Returns a name that no file of the tier has. After a step back of the clock, a begin may
@@ -386,6 +360,49 @@ impl Store {
         let name = format!("{}-{number:010}.{FILE_EXTENSION}", tier.name());
         self.directory.join(name)
     }
+}
+
+/// Returns whether the clock was set back by more than a window between two files or blocks.
+const fn is_set_back(end: u32, next_begin: u32) -> bool {
+    next_begin.saturating_add(WINDOW_SECONDS) < end
+}
+
+fn visit(files: &[Blocks], kind: Kind, times: &Range<u32>, each: &mut dyn FnMut(Block)) {
+    for file in files {
+        if file.overlaps(times) {
+            file.visit(kind, times, each);
+        }
+    }
+}
+
+fn rows<N: Name, R: Row + Merge>(
+    files: &[Blocks],
+    kind: Kind,
+    times: &Range<u32>,
+    wanted: &dyn Fn(&N) -> bool,
+    each: &mut dyn FnMut(&N, R),
+) {
+    visit(files, kind, times, &mut |block| {
+        columns::read(&block.content, wanted, &mut |name, row: R| {
+            if row.end_time() > times.start && row.end_time() <= times.end {
+                each(name, row);
+            }
+        });
+    });
+}
+
+/// Returns the merged rows of all topics or processes in these files.
+fn gathered<N: Name + Ord + Clone, R: Row + Merge>(
+    files: &[Blocks],
+    kind: Kind,
+    times: &Range<u32>,
+) -> Vec<Series<N, R>> {
+    let mut all = BTreeMap::<N, Vec<R>>::new();
+    rows(files, kind, times, &|_| true, &mut |name, row| {
+        merge_by_name(&mut all, name, row, TEN_SECONDS);
+    });
+    let series = all.into_iter();
+    series.map(|(of, rows)| Series { of, rows }).collect()
 }
 
 /// Creates a directory if it is missing. Fails if little space is free.

@@ -192,9 +192,8 @@ fn a_clock_that_was_in_the_future_does_not_end_the_history() {
     drop(filled(directory.path(), LIMIT, 30_000_000..30_000_015));
     let store = filled(directory.path(), LIMIT, 1005..1030);
     assert_eq!(rows(&store, 60_000..61_800, 1).len(), 1800);
-    let found = rows(&store, 60_000..61_800, 10);
-    // The ten minutes in which the clock was set were condensed too early, without their rest.
-    assert_eq!(found.len(), 180 - 30);
+    // The ten minutes in which the clock was set are in two parts.
+    assert_eq!(rows(&store, 60_000..61_800, 10).len(), 180);
     assert_eq!(store.state(61_800).unwrap().content, b"state 61740");
 }
 
@@ -207,6 +206,50 @@ fn a_clock_that_was_some_minutes_ahead_hides_no_rows_of_the_right_time() {
     assert_eq!(rows(&store, 62_400..63_480, 1).len(), 1080);
     // Ten minutes are merged, and eight are not yet.
     assert_eq!(rows(&store, 62_400..63_480, 10).len(), 60 + 480);
+}
+
+fn messages(rows: &[TopicRow]) -> u32 {
+    rows.iter().map(|row| row.messages).sum()
+}
+
+/// Returns the messages of all rows of these minutes.
+fn expected(minutes: std::ops::Range<u32>) -> u32 {
+    let seconds = minutes.start * 60 + 1..=minutes.end * 60;
+    seconds.map(|at| row(at).messages).sum()
+}
+
+#[test]
+fn after_a_clock_was_ahead_no_row_is_merged_twice() {
+    let directory = tempfile::tempdir().unwrap();
+    drop(filled(directory.path(), LIMIT, 0..480));
+    drop(filled(directory.path(), LIMIT, 600..620));
+    let store = filled(directory.path(), LIMIT, 500..960);
+    let found = rows(&store, 0..480 * 60, 60);
+    assert_eq!(messages(&found), expected(0..480));
+    assert!(found.is_sorted_by(|one, two| one.at < two.at));
+    // Both clocks had the minutes from 600 on.
+    let found = rows(&store, 480 * 60..960 * 60, 60);
+    assert_eq!(messages(&found), expected(500..960) + expected(600..620));
+}
+
+#[test]
+fn rows_of_a_clock_that_was_set_back_into_written_hours_are_merged_once() {
+    let directory = tempfile::tempdir().unwrap();
+    drop(filled(directory.path(), LIMIT, 0..480));
+    let store = filled(directory.path(), LIMIT, 400..490);
+    let found = rows(&store, 0..490 * 60, 60);
+    assert_eq!(messages(&found), expected(0..480) + expected(400..490));
+}
+
+#[test]
+fn a_clock_that_is_set_back_by_seconds_merges_nothing_twice() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = filled(directory.path(), LIMIT, 0..20);
+    store.append(Tier::Seconds, &minute(1_130)).unwrap();
+    store.condense(1_190).unwrap();
+    let store = filled(directory.path(), LIMIT, 20..40);
+    let found = rows(&store, 0..1_200, 60);
+    assert_eq!(messages(&found), expected(0..20));
 }
 
 #[test]
@@ -280,6 +323,26 @@ fn a_file_that_was_cut_anywhere_keeps_its_whole_blocks_and_is_continued() {
             fs::remove_file(file).unwrap();
         }
     }
+}
+
+#[test]
+fn zeros_after_a_power_cut_are_no_blocks() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = filled(directory.path(), LIMIT, 1000..1003);
+    let (facts, state) = (store.facts(), store.state(60_180));
+    drop(store);
+    let file = files(directory.path()).remove(0);
+    let mut bytes = fs::read(&file).unwrap();
+    bytes.extend([0; 4096]);
+    fs::write(&file, bytes).unwrap();
+    let store = Store::open(directory.path(), LIMIT).unwrap();
+    assert_eq!(store.facts(), facts);
+    assert_eq!(rows(&store, 60_000..60_180, 1).len(), 180);
+    assert_eq!(store.state(60_180), state);
+    // The zeros are overwritten.
+    store.append(Tier::Seconds, &minute(60_180)).unwrap();
+    let store = Store::open(directory.path(), LIMIT).unwrap();
+    assert_eq!(rows(&store, 60_000..60_240, 1).len(), 240);
 }
 
 proptest! {

@@ -72,6 +72,8 @@ pub(crate) struct Found {
     pub(crate) bags: Vec<Bag>,
     /// Names of bags that are written or were changed just now.
     pub(crate) unfinished: Vec<String>,
+    /// Whether a complete bag without a writer only waits until its files are old enough.
+    pub(crate) is_settling: bool,
 }
 
 impl Fingerprint {
@@ -181,8 +183,10 @@ impl Scanner {
                 true => QUIET_TIME,
                 false => INCOMPLETE_QUIET_TIME,
             };
-            if lock::is_held(&path) || !is_quiet(&now, quiet) {
+            let is_written = lock::is_held(&path);
+            if is_written || !is_quiet(&now, quiet) {
                 found.unfinished.push(name.clone());
+                found.is_settling |= !is_written && now.content.is_complete;
             } else {
                 found.bags.push(Bag {
                     name: name.clone(),
@@ -325,6 +329,7 @@ mod tests {
             (names(&found), &*found.unfinished),
             (vec![], &["drive".to_owned()][..])
         );
+        assert!(!found.is_settling, "it has a writer");
         drop(writer);
         let found = scanner.scan(root).unwrap();
         assert_eq!(names(&found), ["drive"]);
@@ -333,6 +338,7 @@ mod tests {
         age(&root.join("drive"), 10);
         let found = Scanner::default().scan(root).unwrap();
         assert_eq!(found.unfinished, ["drive"]);
+        assert!(!found.is_settling);
     }
 
     #[test]
@@ -340,7 +346,9 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let root = directory.path();
         write(root, "lap", false).close(BTreeMap::new()).unwrap();
-        assert_eq!(Scanner::default().scan(root).unwrap().unfinished, ["lap"]);
+        let found = Scanner::default().scan(root).unwrap();
+        assert_eq!(found.unfinished, ["lap"]);
+        assert!(found.is_settling);
         fs::copy(root.join("lap/lap_0.mcap"), root.join("lap/lap_1.mcap")).unwrap();
         age(&root.join("lap"), 100);
         let found = Scanner::default().scan(root).unwrap();

@@ -13,7 +13,7 @@ use tokio::task::{spawn_blocking, yield_now};
 use crate::bags::{Bag, Fingerprint};
 use crate::manifest::{self, Manifest};
 use crate::shipper::Shipper;
-use crate::state::{Delivery, FileDelivery, Upload};
+use crate::state::{Delivery, Destination, FileDelivery, Upload};
 use crate::store::{Store, StoreError};
 
 /// Size of a part in bytes. A smaller file is sent at once.
@@ -32,6 +32,25 @@ pub(crate) enum Step {
     Delivered,
     /// Another bag is more urgent, or the window closed.
     Interrupted,
+}
+
+/// What a step of one file did.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Sent {
+    /// The destination has more of it than before.
+    Done,
+    /// A triggered bag waits. The file begins again later.
+    Interrupted,
+}
+
+/// A checksum of a file that is continued after an interruption.
+pub(crate) struct PartialChecksum {
+    path: PathBuf,
+    /// State of the bag to which the file belongs.
+    fingerprint: Fingerprint,
+    digest: Sha256,
+    /// Bytes that were read.
+    bytes: u64,
 }
 
 /// Why a delivery failed.
@@ -71,31 +90,45 @@ impl Shipper {
     pub(crate) async fn deliver(&mut self, bag: &Bag) -> Result<Step, DeliveryError> {
         let mut delivery = self.recorded(bag).await?;
         for index in 0..delivery.files.len() {
-            let Some(file) = delivery.files.get_mut(index) else {
-                break;
+            let file = delivery.files.get(index);
+            let Some(file) = file.filter(|file| file.sha256.is_none()) else {
+                continue;
             };
-            if file.sha256.is_none() {
-                file.sha256 = Some(checksum(&bag.path.join(&file.name), file.bytes).await?);
-                self.records.keep(&bag.name, delivery.clone());
+            let (name, bytes) = (file.name.clone(), file.bytes);
+            let Some(sha256) = self.checksum(bag, &name, bytes).await? else {
+                return Ok(Step::Interrupted);
+            };
+            if let Some(file) = delivery.files.get_mut(index) {
+                file.sha256 = Some(sha256);
             }
+            self.records.keep(&bag.name, delivery.clone());
         }
         if delivery.remote.is_none() && self.choose_name(bag, &mut delivery).await? {
             return self.finish(bag, delivery);
         }
-        for index in 0..delivery.files.len() {
-            while delivery
-                .files
-                .get(index)
-                .is_some_and(|file| !file.is_delivered)
-            {
-                if self.is_interrupted(bag) {
-                    return Ok(Step::Interrupted);
+        // All sizes are compared at the end: the destination may lose files during a long delivery.
+        let goals: [fn(&FileDelivery) -> bool; 2] = [|file| file.is_sent, |file| file.is_delivered];
+        for is_reached in goals {
+            for index in 0..delivery.files.len() {
+                while delivery
+                    .files
+                    .get(index)
+                    .is_some_and(|file| !is_reached(file))
+                {
+                    let mut is_interrupted = self.is_interrupted(bag);
+                    if !is_interrupted {
+                        self.store()?.reload_credentials()?;
+                        let sent = self.send(bag, &mut delivery, index).await;
+                        self.records.keep(&bag.name, delivery.clone());
+                        is_interrupted = sent? == Sent::Interrupted;
+                    }
+                    if is_interrupted {
+                        delivery.forget_sizes();
+                        self.records.keep(&bag.name, delivery);
+                        return Ok(Step::Interrupted);
+                    }
+                    self.show_progress(bag, &delivery);
                 }
-                self.store()?.reload_credentials()?;
-                let sent = self.send(bag, &mut delivery, index).await;
-                self.records.keep(&bag.name, delivery.clone());
-                sent?;
-                self.show_progress(bag, &delivery);
             }
         }
         if Fingerprint::of(&bag.path).ok().as_ref() != Some(&bag.fingerprint) {
@@ -117,10 +150,12 @@ impl Shipper {
         self.finish(bag, delivery)
     }
 
-    /// Returns the record of a bag, or a new one. A record of another bag of this name is dropped.
+    /// Returns the record of a bag, or a new one. A record of another bag of this name, or of
+    /// another destination, is dropped.
     async fn recorded(&mut self, bag: &Bag) -> Result<Delivery, DeliveryError> {
         if let Some(delivery) = self.records.get(&bag.name) {
-            if delivery.fingerprint == bag.fingerprint {
+            if delivery.fingerprint == bag.fingerprint && delivery.destination == self.destination()
+            {
                 return Ok(delivery.clone());
             }
             self.drop_record(&bag.name).await?;
@@ -132,6 +167,7 @@ impl Shipper {
             ..FileDelivery::default()
         });
         Ok(Delivery {
+            destination: self.destination(),
             fingerprint: bag.fingerprint.clone(),
             is_complete: bag.content.is_complete,
             files: files.collect(),
@@ -144,6 +180,10 @@ impl Shipper {
         let Some(delivery) = self.records.forget(name) else {
             return Ok(());
         };
+        // The uploads of another destination are unknown to this one.
+        if delivery.destination != self.destination() {
+            return Ok(());
+        }
         for file in delivery.files.iter().filter(|file| !file.is_delivered) {
             if let Some(upload) = &file.upload {
                 let path = self.path(&delivery, &file.name);
@@ -203,15 +243,15 @@ impl Shipper {
         bag: &Bag,
         delivery: &mut Delivery,
         index: usize,
-    ) -> Result<(), DeliveryError> {
+    ) -> Result<Sent, DeliveryError> {
         let Some(name) = delivery.files.get(index).map(|file| file.name.clone()) else {
-            return Ok(());
+            return Ok(Sent::Done);
         };
         let path = self.path(delivery, &name);
         let source = bag.path.join(&name);
         let store = self.store()?;
         let Some(file) = delivery.files.get_mut(index) else {
-            return Ok(());
+            return Ok(Sent::Done);
         };
         if file.is_sent {
             // Each answer is recorded, so that a poor link leads to an end as well.
@@ -219,20 +259,81 @@ impl Shipper {
             file.is_sent = file.is_delivered;
             file.upload = None;
             return match file.is_delivered {
-                true => Ok(()),
+                true => Ok(Sent::Done),
                 false => Err(StoreError::Missing(None).into()),
             };
         }
         if !store.is_resumable() {
-            send_to_folder(store, &path, &source, file.bytes).await?;
-        } else if file.bytes <= PART_BYTES {
+            let sent = self.copy(bag, &path, &source, file.bytes).await?;
+            file.is_sent = sent == Sent::Done;
+            return Ok(sent);
+        }
+        if file.bytes > PART_BYTES {
+            send_part(store, &path, &source, file).await?;
+        } else {
             let content = read_part(&source, 0, file.bytes)?;
             store.put(&path, content).await?;
-        } else {
-            return send_part(store, &path, &source, file).await;
+            file.is_sent = true;
         }
-        file.is_sent = true;
-        Ok(())
+        Ok(Sent::Done)
+    }
+
+    /// Copies a file into a folder, unless a triggered bag waits.
+    async fn copy(
+        &mut self,
+        bag: &Bag,
+        path: &Path,
+        source: &FilePath,
+        bytes: u64,
+    ) -> Result<Sent, DeliveryError> {
+        let mut target = self.store()?.begin_file(path).await?;
+        let mut begin = 0;
+        while begin < bytes {
+            // The end of a window does not interrupt it, because the file would begin again.
+            if begin > 0 && self.is_overtaken(bag) {
+                target.abort().await;
+                return Ok(Sent::Interrupted);
+            }
+            let length = PART_BYTES.min(bytes - begin);
+            let written = match read_part(source, begin, length) {
+                Ok(content) => target.write(content).await.map_err(DeliveryError::from),
+                Err(error) => Err(error),
+            };
+            if let Err(error) = written {
+                target.abort().await;
+                return Err(error);
+            }
+            begin += length;
+        }
+        target.complete().await?;
+        Ok(Sent::Done)
+    }
+
+    /// Returns the SHA-256 of a file of a bag, in hexadecimal digits; `None` if the delivery is
+    /// interrupted. The next call continues.
+    async fn checksum(
+        &mut self,
+        bag: &Bag,
+        name: &str,
+        bytes: u64,
+    ) -> Result<Option<String>, DeliveryError> {
+        let path = bag.path.join(name);
+        let is_of_file =
+            |kept: &mut PartialChecksum| kept.path == path && kept.fingerprint == bag.fingerprint;
+        let kept = self.partial_checksum.take_if(is_of_file);
+        let begin = || PartialChecksum::new(path.clone(), bag.fingerprint.clone());
+        let mut checksum = kept.unwrap_or_else(begin);
+        let mut file = checksum.open()?;
+        let mut buffer = vec![0; READ_BYTES];
+        while checksum.read(&mut file, &mut buffer)? {
+            if self.is_interrupted(bag) {
+                self.partial_checksum = Some(checksum);
+                return Ok(None);
+            }
+            // A signal ends the process between two pieces.
+            yield_now().await;
+        }
+        checksum.text(bytes).map(Some)
     }
 
     /// Returns whether the destination has the manifest, and each file in its size.
@@ -263,6 +364,14 @@ impl Shipper {
         }
         self.records.keep(&bag.name, delivery);
         Ok(Step::Delivered)
+    }
+
+    fn destination(&self) -> Destination {
+        Destination {
+            url: self.settings.url.clone(),
+            endpoint: self.settings.endpoint.clone(),
+            instance: self.settings.instance.clone(),
+        }
     }
 
     /// Returns the path of a file of a bag at the destination.
@@ -333,30 +442,6 @@ async fn send_part(
     }
 }
 
-/// Copies a file into a folder.
-async fn send_to_folder(
-    store: &Store,
-    path: &Path,
-    source: &FilePath,
-    bytes: u64,
-) -> Result<(), DeliveryError> {
-    let mut target = store.begin_file(path).await?;
-    let mut begin = 0;
-    while begin < bytes {
-        let length = PART_BYTES.min(bytes - begin);
-        let written = match read_part(source, begin, length) {
-            Ok(content) => target.write(content).await.map_err(DeliveryError::from),
-            Err(error) => Err(error),
-        };
-        if let Err(error) = written {
-            target.abort().await;
-            return Err(error);
-        }
-        begin += length;
-    }
-    Ok(target.complete().await?)
-}
-
 /// Returns the size of the parts of a file: whole mebibytes, so that the parts do not exceed the
 /// maximum number.
 const fn part_bytes(file: u64) -> u64 {
@@ -383,28 +468,43 @@ fn read_part(path: &FilePath, begin: u64, length: u64) -> Result<Bytes, Delivery
     }
 }
 
-/// Returns the SHA-256 of a file of this size, in hexadecimal digits.
-async fn checksum(path: &FilePath, bytes: u64) -> Result<String, DeliveryError> {
-    let wrong = |error| DeliveryError::Read(path.to_owned(), error);
-    let mut file = File::open(path).map_err(wrong)?;
-    let mut digest = Sha256::new();
-    let mut buffer = vec![0; READ_BYTES];
-    let mut whole = 0;
-    loop {
-        let length = file.read(&mut buffer).map_err(wrong)?;
-        if length == 0 {
-            break;
+impl PartialChecksum {
+    fn new(path: PathBuf, fingerprint: Fingerprint) -> Self {
+        Self {
+            path,
+            fingerprint,
+            digest: Sha256::new(),
+            bytes: 0,
         }
-        digest.update(buffer.get(..length).unwrap_or_default());
-        whole += length as u64;
-        // A signal ends the process between two pieces.
-        yield_now().await;
     }
-    if whole != bytes {
-        return Err(DeliveryError::Changed);
+
+    /// Opens the file at the first byte that was not read.
+    fn open(&self) -> Result<File, DeliveryError> {
+        let open = || {
+            let mut file = File::open(&self.path)?;
+            file.seek(SeekFrom::Start(self.bytes))?;
+            Ok(file)
+        };
+        open().map_err(|error| DeliveryError::Read(self.path.clone(), error))
     }
-    let digest = digest.finalize();
-    Ok(digest.iter().map(|byte| format!("{byte:02x}")).collect())
+
+    /// Reads the next piece. Returns whether another one may follow.
+    fn read(&mut self, file: &mut File, buffer: &mut [u8]) -> Result<bool, DeliveryError> {
+        let length = file.read(buffer);
+        let length = length.map_err(|error| DeliveryError::Read(self.path.clone(), error))?;
+        self.digest.update(buffer.get(..length).unwrap_or_default());
+        self.bytes += length as u64;
+        Ok(length > 0)
+    }
+
+    /// Returns the checksum of a file of this size, in hexadecimal digits.
+    fn text(self, bytes: u64) -> Result<String, DeliveryError> {
+        if self.bytes != bytes {
+            return Err(DeliveryError::Changed);
+        }
+        let digest = self.digest.finalize();
+        Ok(digest.iter().map(|byte| format!("{byte:02x}")).collect())
+    }
 }
 
 #[cfg(test)]
@@ -422,14 +522,20 @@ mod tests {
         }
     }
 
-    #[tokio::test]
-    async fn a_checksum_is_that_of_a_file_of_the_expected_size() {
+    #[test]
+    fn a_checksum_is_that_of_a_file_of_the_expected_size() {
         let file = tempfile::NamedTempFile::new().unwrap();
         std::fs::write(file.path(), "abc").unwrap();
+        let checksum = |bytes| {
+            let path = file.path().to_owned();
+            let mut checksum = PartialChecksum::new(path, Fingerprint::default());
+            // It is interrupted after each byte.
+            while checksum.read(&mut checksum.open()?, &mut [0])? {}
+            checksum.text(bytes)
+        };
         let expected = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad";
-        assert_eq!(checksum(file.path(), 3).await.unwrap(), expected);
-        let changed = checksum(file.path(), 4).await.unwrap_err();
-        assert!(matches!(changed, DeliveryError::Changed));
+        assert_eq!(checksum(3).unwrap(), expected);
+        assert!(matches!(checksum(4), Err(DeliveryError::Changed)));
         assert!(matches!(
             read_part(file.path(), 1, 3),
             Err(DeliveryError::Changed)

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::fs;
 use std::io;
-use std::path::PathBuf;
+use std::path::{Path as FilePath, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -12,8 +12,8 @@ use object_store::path::Path;
 use serde_json::Value;
 use tokio::time::sleep;
 
-use crate::bags::{Bag, Found, Scanner};
-use crate::delivery::{DeliveryError, Step};
+use crate::bags::{Bag, Fingerprint, Found, Scanner};
+use crate::delivery::{DeliveryError, PartialChecksum, Step};
 use crate::settings::{Settings, SettingsError, destination};
 use crate::space;
 use crate::state::{Delivery, Records, RecordsError};
@@ -22,6 +22,8 @@ use crate::store::Store;
 
 /// Time between two scans of the directory.
 const SCAN_INTERVAL: Duration = Duration::from_secs(2);
+/// Time after which a status is written again of which only times have changed.
+const STATUS_INTERVAL: Duration = Duration::from_mins(1);
 /// Pauses after a failure.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
 const LONGEST_PAUSE: Duration = Duration::from_mins(1);
@@ -44,10 +46,16 @@ pub struct Shipper {
     pub(crate) prefix: Path,
     pub(crate) records: Records,
     pub(crate) findings: Option<Findings>,
+    /// Checksum whose computation was interrupted.
+    pub(crate) partial_checksum: Option<PartialChecksum>,
     observer: Option<Observer>,
     store: Option<Store>,
     scanner: Scanner,
     status: Status,
+    /// The status on disk, and when it was written.
+    written: Option<(Instant, Status)>,
+    /// Time of the next attempt to make space, after a failed one.
+    space_attempt: Option<Instant>,
     /// Failures that concern one bag, until its delivery. A bag with more of them waits behind
     /// others.
     failures: BTreeMap<String, u32>,
@@ -115,9 +123,12 @@ impl Shipper {
             status,
             prefix,
             findings,
+            partial_checksum: None,
             observer,
             store: None,
             scanner: Scanner::default(),
+            written: None,
+            space_attempt: None,
             failures: BTreeMap::new(),
             failures_in_row: 0,
             logged: None,
@@ -147,7 +158,8 @@ impl Shipper {
         }
     }
 
-    /// Delivers the finished bags once, without regard to windows.
+    /// Delivers the finished bags once, without regard to windows. Waits for bags that ended just
+    /// now.
     ///
     /// # Errors
     /// Fails if a bag waits after some attempts, or if the directory cannot be read.
@@ -157,10 +169,11 @@ impl Shipper {
         loop {
             let wait = self.deliver_step().await?;
             let waiting = self.waiting().len();
-            if waiting == 0 {
+            // A bag that ended just now is finished after a moment.
+            if waiting == 0 && !self.found.is_settling {
                 return Ok(self.status.clone());
             }
-            if self.failures_in_row >= MAX_FAILURES {
+            if waiting > 0 && self.failures_in_row >= MAX_FAILURES {
                 let failure = self.status.last_failure.clone().unwrap_or_default();
                 return Err(ShipError::Undelivered {
                     waiting,
@@ -249,9 +262,11 @@ impl Shipper {
     /// Returns whether the delivery of a bag ends for now: the window closed, or a triggered bag
     /// waits behind one that is not.
     pub(crate) fn is_interrupted(&mut self, bag: &Bag) -> bool {
-        if !self.is_permitted(bag) {
-            return true;
-        }
+        !self.is_permitted(bag) || self.is_overtaken(bag)
+    }
+
+    /// Returns whether a triggered bag waits behind this one, which is not.
+    pub(crate) fn is_overtaken(&mut self, bag: &Bag) -> bool {
         let is_due = self
             .last_scan
             .is_none_or(|scan| scan.elapsed() >= SCAN_INTERVAL);
@@ -287,12 +302,17 @@ impl Shipper {
     /// Deletes delivered bags while space is needed, the oldest first. Each is confirmed first.
     async fn make_space(&mut self) {
         self.remove_deleted();
+        if self.space_attempt.is_some_and(|at| at > Instant::now()) {
+            return;
+        }
         while space::is_needed(&self.settings.recordings, self.settings.space) {
             let is_delivered = |bag: &&Bag| {
                 let record = self.records.get(&bag.name);
-                record.is_some_and(|record| {
+                let is_delivered = record.is_some_and(|record| {
                     record.is_delivered && record.fingerprint == bag.fingerprint
-                })
+                });
+                // Windows hold for the requests that confirm a bag.
+                is_delivered && self.is_permitted(bag) && !self.aside(&bag.name).exists()
             };
             let bags = self.found.bags.iter().filter(is_delivered);
             let Some(bag) = bags.min_by_key(|bag| bag.began()).cloned() else {
@@ -311,25 +331,41 @@ impl Shipper {
                     return;
                 }
                 Err(error) => {
-                    self.failed(&bag, &error).await;
+                    let pause = self.failed(&bag, &error).await;
+                    self.space_attempt = Some(Instant::now() + pause);
                     return;
                 }
             }
-            let aside = self
-                .settings
-                .recordings
-                .join(format!("{DELETED_PREFIX}{}", bag.name));
-            // After a loss of power, a bag is there as a whole or not at all.
-            let removed = fs::rename(&bag.path, &aside).and_then(|()| fs::remove_dir_all(&aside));
-            if let Err(error) = removed {
-                tracing::warn!(bag = %bag.name, %error, "failed to delete a delivered bag");
+            // The bag may have changed during the requests.
+            if Fingerprint::of(&bag.path).ok().as_ref() != Some(&bag.fingerprint) {
                 return;
             }
-            tracing::info!(bag = %bag.name, "deleted a delivered bag for space");
+            let aside = self.aside(&bag.name);
+            // After a loss of power, all files of a bag are there, or none.
+            let removed = fs::rename(&bag.path, &aside)
+                .and_then(|()| remove_files(&aside, &bag.path, &bag.fingerprint));
+            match removed {
+                Ok(Removal::Whole) => {
+                    tracing::info!(bag = %bag.name, "deleted a delivered bag for space");
+                }
+                Ok(Removal::Files) => {
+                    tracing::warn!(bag = %bag.name, "deleted the files of a delivered bag for space: other entries of it stay");
+                }
+                Err(error) => {
+                    tracing::warn!(bag = %bag.name, %error, "failed to delete a delivered bag");
+                    return;
+                }
+            }
             self.status.deleted_bags += 1;
             self.records.forget(&bag.name);
             self.found.bags.retain(|other| other.name != bag.name);
         }
+    }
+
+    /// Returns the path of a bag that is being deleted.
+    fn aside(&self, bag: &str) -> PathBuf {
+        let name = format!("{DELETED_PREFIX}{bag}");
+        self.settings.recordings.join(name)
     }
 
     /// Removes the rest of bags whose deletion was interrupted.
@@ -338,12 +374,17 @@ impl Shipper {
             .into_iter()
             .flatten();
         for entry in entries.flatten() {
-            if entry
-                .file_name()
-                .to_string_lossy()
-                .starts_with(DELETED_PREFIX)
+            let name = entry.file_name();
+            let bag = name
+                .to_str()
+                .and_then(|name| name.strip_prefix(DELETED_PREFIX));
+            let aside = entry.path();
+            // Only the files of a delivered bag have such a path.
+            if let Some(bag) = bag
+                && entry.file_type().is_ok_and(|kind| kind.is_dir())
+                && let Ok(files) = Fingerprint::of(&aside)
             {
-                let _ = fs::remove_dir_all(entry.path());
+                let _ = remove_files(&aside, &self.settings.recordings.join(bag), &files);
             }
         }
     }
@@ -436,7 +477,39 @@ impl Shipper {
         self.status.waiting_bytes = bytes;
         self.status.unfinished_bags = self.found.unfinished.len() as u64;
         self.status.opens_in_seconds = self.time_to_window().as_secs();
-        self.status.write(&self.settings.state);
+        let is_written = self.written.as_ref().is_some_and(|(at, written)| {
+            at.elapsed() < STATUS_INTERVAL && written.is_same(&self.status)
+        });
+        if !is_written && self.status.write(&self.settings.state).is_ok() {
+            self.written = Some((Instant::now(), self.status.clone()));
+        }
+    }
+}
+
+/// What a deletion removed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Removal {
+    /// The directory of the bag.
+    Whole,
+    /// The files of the bag. Its directory has other entries, which were not delivered.
+    Files,
+}
+
+/// Removes the files of a bag, and its directory `aside`. A directory with other entries gets the
+/// path `bag` again.
+fn remove_files(aside: &FilePath, bag: &FilePath, files: &Fingerprint) -> io::Result<Removal> {
+    for (name, _) in files.files() {
+        match fs::remove_file(aside.join(name)) {
+            Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
+            _ => {}
+        }
+    }
+    match fs::remove_dir(aside) {
+        Err(error) if error.kind() == io::ErrorKind::DirectoryNotEmpty => {
+            fs::rename(aside, bag)?;
+            Ok(Removal::Files)
+        }
+        removed => removed.map(|()| Removal::Whole),
     }
 }
 
@@ -460,4 +533,112 @@ fn describe(error: &dyn std::error::Error) -> String {
         cause = deeper.source();
     }
     text
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::SystemTime;
+
+    use ros2probe_bag::{Options, Writer};
+    use sha2::{Digest as _, Sha256};
+
+    use super::*;
+    use crate::manifest::Manifest;
+    use crate::settings::SpaceLimits;
+    use crate::windows::Windows;
+
+    /// Writes a bag that ended some time ago.
+    fn record(root: &FilePath, name: &str, options: Options) {
+        let bag = root.join(name);
+        let writer = Writer::create(&bag, options).unwrap();
+        writer.close(BTreeMap::new()).unwrap();
+        let then = SystemTime::now() - Duration::from_secs(60);
+        for entry in fs::read_dir(&bag).unwrap() {
+            let file = fs::File::open(entry.unwrap().path()).unwrap();
+            file.set_modified(then).unwrap();
+        }
+    }
+
+    #[tokio::test]
+    async fn a_triggered_bag_does_not_wait_for_the_checksums_of_another_one() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = |name: &str| directory.path().join(name);
+        for name in ["bags", "folder"] {
+            fs::create_dir(path(name)).unwrap();
+        }
+        let settings = Settings {
+            url: format!("file://{}", path("folder").display()),
+            endpoint: None,
+            region: None,
+            instance: "robot".to_owned(),
+            credentials_file: None,
+            ca_file: None,
+            max_bytes_per_second: None,
+            windows: Windows::default(),
+            triggered_always: false,
+            recordings: path("bags"),
+            state: path("state"),
+            space: SpaceLimits::default(),
+        };
+        let mut shipper = Shipper::new(settings, None, None).unwrap();
+        record(&path("bags"), "drive", Options::default());
+        shipper.scan().unwrap();
+        let drive = shipper.next().unwrap();
+        let mut options = Options::default();
+        let trigger = "{\"snapshot\":\"incident\"}".to_owned();
+        let key = "ros2probe_trigger".to_owned();
+        options.custom_data.insert(key, trigger);
+        record(&path("bags"), "incident", options);
+        shipper.last_scan = None;
+        let step = shipper.deliver(&drive).await.unwrap();
+        assert_eq!(step, Step::Interrupted);
+        assert_eq!(shipper.records.get("drive"), None, "no checksum is known");
+        let incident = shipper.next().unwrap();
+        assert_eq!(incident.name, "incident");
+        let step = shipper.deliver(&incident).await.unwrap();
+        assert_eq!(step, Step::Delivered);
+        assert!(
+            shipper.partial_checksum.is_some(),
+            "the other one continues"
+        );
+        let step = shipper.deliver(&drive).await.unwrap();
+        assert_eq!(step, Step::Delivered);
+        let text = fs::read(path("folder/robot/drive/manifest.json")).unwrap();
+        let manifest: Manifest = serde_json::from_slice(&text).unwrap();
+        for file in manifest.files {
+            let content = fs::read(path("bags/drive").join(&file.name)).unwrap();
+            let digest = Sha256::digest(&content);
+            let expected: String = digest.iter().map(|byte| format!("{byte:02x}")).collect();
+            assert_eq!(file.sha256, expected);
+        }
+    }
+
+    fn names(directory: &FilePath) -> Vec<String> {
+        let entries = fs::read_dir(directory).unwrap();
+        let names = entries.map(|entry| entry.unwrap().file_name().into_string().unwrap());
+        let mut names: Vec<_> = names.collect();
+        names.sort();
+        names
+    }
+
+    #[test]
+    fn a_deletion_removes_the_delivered_files_and_keeps_other_entries() {
+        let directory = tempfile::tempdir().unwrap();
+        let (aside, bag) = (directory.path().join("aside"), directory.path().join("bag"));
+        fs::create_dir(&aside).unwrap();
+        fs::write(aside.join("0.mcap"), "1").unwrap();
+        let files = Fingerprint::of(&aside).unwrap();
+        // A file that is gone is no failure: an earlier deletion was interrupted.
+        fs::remove_file(aside.join("0.mcap")).unwrap();
+        let removed = remove_files(&aside, &bag, &files).unwrap();
+        assert_eq!(removed, Removal::Whole);
+        assert_eq!(names(directory.path()), [""; 0]);
+        fs::create_dir_all(aside.join("camera")).unwrap();
+        fs::write(aside.join("0.mcap"), "1").unwrap();
+        fs::write(aside.join("later.txt"), "2").unwrap();
+        let removed = remove_files(&aside, &bag, &files).unwrap();
+        assert_eq!(removed, Removal::Files);
+        assert_eq!(names(directory.path()), ["bag"]);
+        assert_eq!(names(&bag), ["camera", "later.txt"]);
+    }
 }

@@ -24,6 +24,9 @@ const RECORD_BYTES: u64 = 16 << 20;
 /// The delivery of one bag.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Delivery {
+    /// Destination of its files. A delivery to another one begins again.
+    #[serde(default)]
+    pub(crate) destination: Destination,
     /// State of the bag's files. A bag with another one is delivered anew.
     pub(crate) fingerprint: Fingerprint,
     /// Name of the bag at the destination; `None` until it is chosen.
@@ -35,6 +38,15 @@ pub(crate) struct Delivery {
     pub(crate) manifest: Option<String>,
     /// Whether the destination has the manifest.
     pub(crate) is_delivered: bool,
+}
+
+/// What decides where a bag arrives.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Destination {
+    pub(crate) url: String,
+    pub(crate) endpoint: Option<String>,
+    /// Name of this robot.
+    pub(crate) instance: String,
 }
 
 /// The delivery of one file.
@@ -72,6 +84,13 @@ impl Delivery {
             None => 0,
         });
         (self.files.iter().map(|file| file.bytes).sum(), done.sum())
+    }
+
+    /// Forgets which sizes were compared: the destination may have changed in the meantime.
+    pub(crate) fn forget_sizes(&mut self) {
+        for file in &mut self.files {
+            file.is_delivered = false;
+        }
     }
 }
 
@@ -122,8 +141,11 @@ impl Records {
             let name = path.file_stem().and_then(|name| name.to_str());
             // A damaged record is as none: the bag is compared with the destination.
             if let Some(name) = name.filter(|_| is_record)
-                && let Some(delivery) = read_json(&path)
+                && let Some(mut delivery) = read_json::<Delivery>(&path)
             {
+                if !delivery.is_delivered {
+                    delivery.forget_sizes();
+                }
                 records.deliveries.insert(name.to_owned(), delivery);
             }
         }
@@ -206,7 +228,22 @@ pub(crate) fn write_json<T: Serialize>(path: &Path, value: &T) -> io::Result<()>
     write(path, &serde_json::to_vec_pretty(value)?)
 }
 
+/// Replaces a file of JSON. A loss of power may leave an empty one.
+pub(crate) fn write_json_unsynced<T: Serialize>(path: &Path, value: &T) -> io::Result<()> {
+    replace(path, &serde_json::to_vec_pretty(value)?, |_| Ok(()))
+}
+
 fn write(path: &Path, content: &[u8]) -> io::Result<()> {
+    replace(path, content, File::sync_all)?;
+    let directory = path.parent().unwrap_or(path);
+    File::open(directory)?.sync_all()
+}
+
+fn replace(
+    path: &Path,
+    content: &[u8],
+    finish: impl FnOnce(&File) -> io::Result<()>,
+) -> io::Result<()> {
     let mut part = path.as_os_str().to_owned();
     part.push(".part");
     let part = PathBuf::from(part);
@@ -215,10 +252,8 @@ fn write(path: &Path, content: &[u8]) -> io::Result<()> {
         options.write(true).create(true).truncate(true).mode(0o640);
         let mut file = options.open(&part)?;
         file.write_all(content)?;
-        file.sync_all()?;
-        fs::rename(&part, path)?;
-        let directory = path.parent().unwrap_or(path);
-        File::open(directory)?.sync_all()
+        finish(&file)?;
+        fs::rename(&part, path)
     };
     written().inspect_err(|_| {
         let _ = fs::remove_file(&part);

@@ -1,11 +1,12 @@
 //! What `rp ship --status` prints, and the file in which a running shipper leaves it.
 
+use std::io;
 use std::path::{Path, PathBuf};
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 
-use crate::state::{read_json, write_json};
+use crate::state::{read_json, write_json_unsynced};
 
 /// State of a delivery.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -81,11 +82,21 @@ impl Status {
         read_json(&path(directory))
     }
 
-    /// Writes the state. A failure is ignored: nothing depends on it.
-    pub(crate) fn write(&mut self, directory: &Path) {
+    /// Writes the state. It is not forced to the disk: no delivery depends on it.
+    pub(crate) fn write(&mut self, directory: &Path) -> io::Result<()> {
         self.at = now();
         self.process_id = std::process::id();
-        let _ = write_json(&path(directory), self);
+        write_json_unsynced(&path(directory), self)
+    }
+
+    /// Returns whether only times differ.
+    pub(crate) fn is_same(&self, other: &Self) -> bool {
+        let without_times = |status: &Self| Self {
+            at: String::new(),
+            opens_in_seconds: u64::from(status.opens_in_seconds > 0),
+            ..status.clone()
+        };
+        without_times(self) == without_times(other)
     }
 }
 

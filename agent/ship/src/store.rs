@@ -191,7 +191,7 @@ impl Store {
     }
 
     /// Begins a file in a folder. Files of earlier attempts are removed.
-    pub(crate) async fn begin_file(&self, path: &Path) -> Result<FolderFile<'_>, StoreError> {
+    pub(crate) async fn begin_file(&self, path: &Path) -> Result<FolderFile, StoreError> {
         let Client::Folder(folder) = &self.client else {
             return Err(unsupported());
         };
@@ -200,7 +200,7 @@ impl Store {
         let upload = folder.put_multipart(path).await;
         Ok(FolderFile {
             upload: upload.map_err(|error| self.failed(&error))?,
-            store: self,
+            link: Arc::clone(&self.link),
         })
     }
 
@@ -220,7 +220,7 @@ impl Store {
 
     fn failed(&self, error: &Error) -> StoreError {
         if matches!(self.client, Client::Folder(_)) {
-            return StoreError::Unusable(innermost(error));
+            return unusable(error);
         }
         match self.link.refusal() {
             Some(refusal) if refusal.status == hyper::StatusCode::NOT_FOUND => {
@@ -237,20 +237,20 @@ impl Store {
 }
 
 /// A file in a folder, which has its name once it is complete.
-pub(crate) struct FolderFile<'a> {
+pub(crate) struct FolderFile {
     upload: Box<dyn object_store::MultipartUpload>,
-    store: &'a Store,
+    link: Arc<Link>,
 }
 
-impl FolderFile<'_> {
+impl FolderFile {
     /// Appends bytes.
     pub(crate) async fn write(&mut self, content: Bytes) -> Result<(), StoreError> {
         let mut rest = content;
         while !rest.is_empty() {
             let piece = rest.split_to(rest.len().min(PIECE_BYTES * 16));
-            sleep_until(self.store.link.reserve(piece.len())).await;
+            sleep_until(self.link.reserve(piece.len())).await;
             let put = self.upload.put_part(piece.into()).await;
-            put.map_err(|error| self.store.failed(&error))?;
+            put.map_err(|error| unusable(&error))?;
         }
         Ok(())
     }
@@ -258,9 +258,7 @@ impl FolderFile<'_> {
     /// Completes the file, which is then on disk.
     pub(crate) async fn complete(mut self) -> Result<(), StoreError> {
         let completed = self.upload.complete().await;
-        completed
-            .map(drop)
-            .map_err(|error| self.store.failed(&error))
+        completed.map(drop).map_err(|error| unusable(&error))
     }
 
     /// Removes the unfinished file.
@@ -282,6 +280,10 @@ fn remove_attempts(file: &std::path::Path) {
             let _ = fs::remove_file(entry.path());
         }
     }
+}
+
+fn unusable(error: &Error) -> StoreError {
+    StoreError::Unusable(innermost(error))
 }
 
 fn unsupported() -> StoreError {

@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
 use ros2probe_metrics::catalogue::{CATALOGUE, Kind};
@@ -191,6 +192,25 @@ fn samples_refused_temporarily_are_sent_later_in_order_and_once() {
 }
 
 #[test]
+fn a_receiver_that_demands_no_pause_gets_growing_pauses() {
+    let directory = tempfile::tempdir().unwrap();
+    let requests = Arc::new(AtomicUsize::new(0));
+    let counted = Arc::clone(&requests);
+    let receiver = Receiver::start(move |_| {
+        counted.fetch_add(1, Ordering::Relaxed);
+        Reply {
+            headers: vec![("Retry-After", "0".to_owned())],
+            ..Reply::status(503)
+        }
+    });
+    let mut agent = sending(&receiver, directory.path(), "");
+    agent.wait_for_log("out of reach");
+    std::thread::sleep(Duration::from_secs(5));
+    let requests = requests.load(Ordering::Relaxed);
+    assert!((2..=4).contains(&requests), "{requests}");
+}
+
+#[test]
 fn a_sample_that_a_receiver_refuses_drops_no_other_sample() {
     let directory = tempfile::tempdir().unwrap();
     let receiver = Receiver::start(|_| Reply::status(503));
@@ -370,6 +390,30 @@ fn a_receiver_that_demands_certificates_accepts_a_renewed_one() {
         error.contains("has no valid content (certificates in PEM)"),
         "{error}"
     );
+}
+
+#[test]
+fn a_damaged_replaced_file_is_logged_once_and_stops_no_samples() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = |name: &str| directory.path().join(name);
+    make_certificate(directory.path());
+    let certificate = CertificateDer::from_pem_file(path("certificate")).unwrap();
+    let key = PrivateKeyDer::from_pem_file(path("key")).unwrap();
+    let config = ServerConfig::builder().with_no_client_auth();
+    let config = config.with_single_cert(vec![certificate], key).unwrap();
+    let receiver = Receiver::start_tls(config, Reply::stored);
+    std::fs::copy(path("authority"), path("robot.authority")).unwrap();
+    let more = format!(", ca_file: {}", path("robot.authority").display());
+    let url = format!("https://localhost:{}", receiver.address.port());
+    let mut agent = sending_to(&url, directory.path(), &more);
+    receiver.wait_for("samples", |stored| stored.len() > 1);
+    std::fs::write(path("robot.authority"), "no certificate").unwrap();
+    agent.wait_for_log("a replaced file of remote write cannot be used");
+    let before = receiver.stored().len();
+    receiver.wait_for("samples", |stored| stored.len() > before + 3);
+    let log = agent.log();
+    assert_eq!(log.matches("cannot be used").count(), 1, "{log}");
+    assert!(!log.contains("out of reach"), "{log}");
 }
 
 #[test]

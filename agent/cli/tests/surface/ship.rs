@@ -6,6 +6,8 @@ use std::fs::{self, File, FileTimes};
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Output, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant, SystemTime};
 
 use crate::rp;
@@ -336,6 +338,65 @@ fn a_bag_arrives_in_a_folder_with_its_manifest() {
     assert!(robot.bag("drive").exists());
 }
 
+/// Begins the delivery of a bag to a folder, and kills the process after the first file.
+fn begin_delivery(folder: &Path) -> Robot {
+    let robot = Robot::to(&format!("file://{}", folder.display()), "");
+    robot.configure("  max_bytes_per_second: 2000000\n", "");
+    robot.record("drive", MIB, 100);
+    fs::write(robot.bag("drive").join("notes.bin"), vec![7; 8 * MIB]).unwrap();
+    age(&robot.bag("drive"), 100);
+    let running = robot.start();
+    robot.wait_for("first file", |status| {
+        let done = status["uploading"]["done_bytes"].as_u64();
+        done.is_some_and(|done| done >= MIB as u64)
+    });
+    running.kill();
+    robot.configure("", "");
+    let delivered = files(&folder.join("robot-17/drive"));
+    assert!(delivered.contains_key("drive_0.mcap"));
+    assert!(!delivered.contains_key("manifest.json"));
+    robot
+}
+
+#[test]
+fn a_bag_is_whole_at_the_destination_that_was_configured_in_the_middle() {
+    let first = tempfile::tempdir().unwrap();
+    let mut robot = begin_delivery(first.path());
+    let second = tempfile::tempdir().unwrap();
+    robot.url = format!("file://{}", second.path().display());
+    robot.configure("", "");
+    robot.delivers();
+    let delivered = files(&second.path().join("robot-17/drive"));
+    assert_whole(&files(&robot.bag("drive")), delivered);
+    // A delivered bag is not sent to the next one.
+    let third = tempfile::tempdir().unwrap();
+    robot.url = format!("file://{}", third.path().display());
+    robot.configure("", "");
+    robot.delivers();
+    assert!(!third.path().join("robot-17").exists());
+}
+
+#[test]
+fn a_bag_is_whole_after_the_destination_lost_its_first_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let robot = begin_delivery(folder.path());
+    let delivered = folder.path().join("robot-17/drive");
+    fs::remove_dir_all(&delivered).unwrap();
+    robot.delivers();
+    assert_whole(&files(&robot.bag("drive")), files(&delivered));
+}
+
+#[test]
+fn one_pass_delivers_the_bag_that_ended_just_before() {
+    let store = Store::start();
+    let robot = Robot::of(&store);
+    let writer = robot.write("drive", 1000, 10, None);
+    writer.close(BTreeMap::new()).unwrap();
+    robot.delivers();
+    assert_stored(&store, &robot, "drive");
+    assert_eq!(robot.status()["unfinished_bags"], 0);
+}
+
 #[test]
 fn a_missing_folder_is_not_created() {
     let folder = tempfile::tempdir().unwrap();
@@ -593,6 +654,33 @@ fn a_triggered_bag_overtakes_one_that_is_being_delivered() {
 }
 
 #[test]
+fn a_triggered_bag_overtakes_a_file_that_is_being_copied_into_a_folder() {
+    let folder = tempfile::tempdir().unwrap();
+    let robot = Robot::to(&format!("file://{}", folder.path().display()), "");
+    robot.configure("  max_bytes_per_second: 8000000\n", "");
+    robot.record("drive", 60 * MIB, 100);
+    let running = robot.start();
+    let delivered = folder.path().join("robot-17");
+    let wait_for = |path: &Path| {
+        let deadline = Instant::now() + PATIENCE;
+        while !path.exists() {
+            assert!(Instant::now() < deadline, "no {}", path.display());
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    };
+    wait_for(&delivered.join("drive"));
+    robot.snapshot("incident_1", 1000, 5);
+    wait_for(&delivered.join("incident_1/manifest.json"));
+    assert!(!delivered.join("drive/drive_0.mcap").exists());
+    running.kill();
+    robot.configure("", "");
+    robot.delivers();
+    for bag in ["drive", "incident_1"] {
+        assert_whole(&files(&robot.bag(bag)), files(&delivered.join(bag)));
+    }
+}
+
+#[test]
 fn delivered_bags_are_deleted_only_if_space_is_needed_and_the_store_has_them() {
     let store = Store::start();
     let robot = Robot::of(&store);
@@ -615,6 +703,76 @@ fn delivered_bags_are_deleted_only_if_space_is_needed_and_the_store_has_them() {
     robot.record("new", 90_000, 10);
     assert_eq!(robot.once().status.code(), Some(1));
     assert!(robot.bag("new").exists());
+}
+
+#[test]
+fn a_deletion_for_space_keeps_to_pauses_and_windows() {
+    let store = Store::start();
+    let robot = Robot::of(&store);
+    robot.record("drive", 90_000, 100);
+    robot.delivers();
+    let requests = Arc::new(AtomicUsize::new(0));
+    let counted = Arc::clone(&requests);
+    store.decide(move |_| {
+        counted.fetch_add(1, Ordering::Relaxed);
+        RequestOutcome::Refuse(429, Some(60))
+    });
+    let passes = |ship: &str| {
+        robot.configure(ship, ", max_total_bytes: 65536");
+        let running = robot.start();
+        std::thread::sleep(Duration::from_secs(7));
+        running.end();
+        requests.swap(0, Ordering::Relaxed)
+    };
+    let now = jiff::Zoned::now();
+    let at = |hours: i64| {
+        let time = now.time().wrapping_add(jiff::Span::new().hours(hours));
+        time.strftime("%H:%M").to_string()
+    };
+    let closed = format!("  windows: ['{}-{}']\n", at(2), at(3));
+    assert_eq!(passes(&closed), 0);
+    assert_eq!(passes(""), 1);
+    assert!(robot.bag("drive").exists());
+}
+
+#[test]
+fn an_idle_service_does_not_write_its_status_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let robot = Robot::to(&format!("file://{}", folder.path().display()), "");
+    let running = robot.start();
+    robot.wait_for("status", |status| status["waiting_bags"] == 0);
+    let changed = || {
+        let about = fs::metadata(robot.path("state/ship/status.json"));
+        about.unwrap().modified().unwrap()
+    };
+    let before = changed();
+    std::thread::sleep(Duration::from_secs(5));
+    assert_eq!(changed(), before);
+    robot.record("drive", 1000, 100);
+    robot.wait_for("delivery", |status| status["delivered_bags"] == 1);
+    running.end();
+}
+
+#[test]
+fn a_deletion_for_space_keeps_what_was_not_delivered() {
+    let store = Store::start();
+    let robot = Robot::of(&store);
+    robot.record("drive", 90_000, 100);
+    robot.delivers();
+    // Only the plain files of a bag are delivered.
+    let camera = robot.bag("drive").join("camera");
+    fs::create_dir(&camera).unwrap();
+    fs::write(camera.join("left.yaml"), "width: 640").unwrap();
+    robot.configure("", ", max_total_bytes: 65536");
+    robot.delivers();
+    let left = fs::read_dir(robot.bag("drive")).unwrap().count();
+    assert_eq!(left, 1, "only the directory is left");
+    let text = fs::read_to_string(camera.join("left.yaml")).unwrap();
+    assert_eq!(text, "width: 640");
+    assert_eq!(robot.status()["deleted_bags"], 1);
+    robot.delivers();
+    assert_eq!(robot.status()["deleted_bags"], 1);
+    assert!(camera.join("left.yaml").exists());
 }
 
 /// The test needs root, for a disk of its own.

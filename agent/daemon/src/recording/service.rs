@@ -57,6 +57,8 @@ pub struct Recordings {
     /// State directory with the receipts of delivered bags; `None` if bags are not delivered.
     receipts: Option<PathBuf>,
     list: Mutex<Vec<Arc<Recording>>>,
+    /// Held while a recording begins. A slow storage delays other starts, but no list.
+    beginning: Mutex<()>,
     slots: Arc<Slots>,
 }
 
@@ -210,6 +212,7 @@ impl Recordings {
             library,
             receipts,
             list: Mutex::new(Vec::new()),
+            beginning: Mutex::new(()),
         }
     }
 
@@ -219,9 +222,17 @@ impl Recordings {
     ///
     /// Returns [`Refusal`] if the recording cannot start.
     pub fn begin(&self, wanted: RecordingOptions) -> Result<Arc<Recording>, Refusal> {
+        self.begin_with(wanted, Writer::create)
+    }
+
+    fn begin_with(
+        &self,
+        wanted: RecordingOptions,
+        create: impl FnOnce(&Path, Options) -> Result<Writer, Error>,
+    ) -> Result<Arc<Recording>, Refusal> {
         let filter = Filter::new(wanted.requested.clone())?;
         let (name, directory) = self.bag_directory(wanted.name)?;
-        let mut list = self.list();
+        let _beginning = locked(&self.beginning);
         let Some(place) = self.slots.take() else {
             self.caps.reached(Limit::Recordings, 1);
             return Err(Refusal::TooMany(self.slots.cap()));
@@ -233,8 +244,7 @@ impl Recordings {
         let mut options = wanted.options;
         options.storage.chunk_bytes = options.storage.chunk_bytes.min(CHUNK_BYTES);
         options.max_index_bytes = Some(INDEX_BYTES);
-        let writer = Writer::create(&directory, options);
-        let writer = writer.map_err(|error| refusal(&name, error))?;
+        let writer = create(&directory, options).map_err(|error| refusal(&name, error))?;
         let sources = self.sources(wanted.domain_id);
         let mut recorder =
             Recorder::new(writer, filter, wanted.domain_id, before, sources).with_quota(quota);
@@ -259,6 +269,7 @@ impl Recordings {
         });
         let thread = self.spawn(&recording, recorder, (subscription, place), commands)?;
         *locked(&recording.thread) = Some(thread);
+        let mut list = self.list();
         list.push(Arc::clone(&recording));
         forget_ended(&mut list);
         Ok(recording)
@@ -326,6 +337,8 @@ impl Recordings {
 
     /// Completes all bags at the end of the agent.
     pub fn finish(&self) {
+        // A recording that begins at this moment is completed as well.
+        drop(locked(&self.beginning));
         let list = self.all();
         for recording in &list {
             recording.command(Command::Stop);
@@ -605,4 +618,64 @@ fn forget_ended(list: &mut Vec<Arc<Recording>>) {
         surplus -= usize::from(goes);
         !goes
     });
+}
+
+#[cfg(test)]
+mod tests {
+    use ros2probe_message::Sources as LibrarySources;
+    use tokio_util::sync::CancellationToken;
+
+    use super::*;
+    use crate::agent_facts::SourceKind;
+    use crate::config::Limits;
+    use crate::subscriptions::Caps;
+
+    fn recordings(directory: &Path) -> Recordings {
+        let latest = Arc::new(SnapshotCell::new(SourceKind::Wire));
+        let caps = Caps {
+            subscriptions: 4,
+            bytes: 1 << 20,
+        };
+        let stop = CancellationToken::new();
+        let subscriptions = Arc::new(Subscriptions::new(Arc::clone(&latest), caps, stop));
+        Recordings::new(Components {
+            directory: Some(directory.to_owned()),
+            limits: RecordingLimits {
+                reserve_percent: 0,
+                reserve_bytes: 0,
+                ..RecordingLimits::default()
+            },
+            queue_bytes: 1 << 20,
+            latest,
+            events: Arc::new(EventLog::new()),
+            caps: Arc::new(LimitFigures::new(Limits::default())),
+            figures: Arc::new(RecordingFigures::default()),
+            subscriptions,
+            library: Arc::new(Library::new(LibrarySources::default())),
+            receipts: None,
+        })
+    }
+
+    #[test]
+    fn recordings_are_listed_while_the_storage_of_a_new_one_is_slow() {
+        let directory = tempfile::tempdir().unwrap();
+        let recordings = recordings(directory.path());
+        let wanted = RecordingOptions {
+            name: Some("slow".to_owned()),
+            requested: FilterOptions::everything(),
+            domain_id: 0,
+            options: Options::default(),
+            paused: false,
+        };
+        let begun = recordings.begin_with(wanted, |directory, options| {
+            assert!(recordings.list.try_lock().is_ok(), "the list is locked");
+            assert!(recordings.all().is_empty() && recordings.find("slow").is_none());
+            Writer::create(directory, options)
+        });
+        let recording = begun.unwrap();
+        assert_eq!(recordings.all().len(), 1);
+        recording.command(Command::Abort);
+        recordings.finish();
+        assert_eq!(recording.status().state, RecordingState::Ended);
+    }
 }

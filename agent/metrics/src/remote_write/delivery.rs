@@ -115,6 +115,8 @@ struct Sender<'a> {
     is_working: Option<bool>,
     /// Whether a refusal was logged since the last success.
     is_refusal_logged: bool,
+    /// Whether a replaced file could not be used at the last request.
+    has_unusable_file: bool,
 }
 
 impl Waiting {
@@ -123,20 +125,35 @@ impl Waiting {
     }
 
     /// Takes the oldest samples, or none at the end. Returns `None` while more may come.
-    fn take(&self) -> Option<Vec<Arc<Scrape>>> {
+    fn take(&self, figures: &Figures) -> Option<Vec<Arc<Scrape>>> {
         let mut state = self.state();
         let batch = state.backlog.take();
         state.taken = batch.first().map(|scrape| scrape.at);
+        state.publish(figures);
         (!batch.is_empty() || state.is_closed).then_some(batch)
+    }
+
+    /// Removes the samples that were taken. The next [`Self::take`] publishes the figures, because
+    /// it reads the time of the oldest samples on disk.
+    fn settled(&self) {
+        let mut state = self.state();
+        state.backlog.delivered();
+        state.taken = None;
     }
 
     fn change(&self, figures: &Figures, change: impl FnOnce(&mut State)) {
         let mut state = self.state();
         change(&mut state);
-        let oldest = state.taken.or(state.backlog.oldest_in_memory());
-        figures.waiting(state.backlog.disk_bytes(), oldest);
+        state.publish(figures);
         drop(state);
         self.added.notify_one();
+    }
+}
+
+impl State {
+    fn publish(&self, figures: &Figures) {
+        let oldest = self.taken.or(self.backlog.oldest_in_memory());
+        figures.waiting(self.backlog.disk_bytes(), oldest);
     }
 }
 
@@ -153,6 +170,7 @@ impl Job {
             is_known: false,
             is_working: None,
             is_refusal_logged: false,
+            has_unusable_file: false,
         };
         let deliver = async {
             tokio::select! {
@@ -222,7 +240,7 @@ impl Job {
     async fn take(&self) -> Vec<Arc<Scrape>> {
         loop {
             let added = self.waiting.added.notified();
-            if let Some(batch) = self.waiting.take() {
+            if let Some(batch) = self.waiting.take(&self.figures) {
                 return batch;
             }
             added.await;
@@ -239,10 +257,7 @@ impl Sender<'_> {
                 return;
             }
             self.settle(&batch).await;
-            self.job.waiting.change(&self.job.figures, |state| {
-                state.backlog.delivered();
-                state.taken = None;
-            });
+            self.job.waiting.settled();
         }
     }
 
@@ -276,9 +291,7 @@ impl Sender<'_> {
         let mut pause = FIRST_PAUSE;
         let mut body = self.body(part);
         loop {
-            if let Err(error) = self.client.reload_files() {
-                self.failed(&error.to_string());
-            }
+            self.reload_files();
             let length = body.len();
             let answer = match self.client.send(body.clone(), self.version).await {
                 // A receiver of version 2.0 states it, but the portal of a network does not.
@@ -316,10 +329,21 @@ impl Sender<'_> {
                 WriteResult::RetryLater(reason, demanded) => {
                     figures.count_request(Request::Retried, length);
                     self.failed(&reason);
-                    sleep(demanded.unwrap_or(pause)).await;
+                    // A receiver can demand a longer pause, but no shorter one.
+                    sleep(pause.max(demanded.unwrap_or_default())).await;
                     pause = (pause * 2).min(LONGEST_PAUSE);
                 }
             }
+        }
+    }
+
+    /// Uses replaced files. If one of them cannot be used, the previous ones remain in use, and the
+    /// first failure is logged.
+    fn reload_files(&mut self) {
+        let reloaded = self.client.reload_files();
+        let failed_before = std::mem::replace(&mut self.has_unusable_file, reloaded.is_err());
+        if let (Err(error), false) = (reloaded, failed_before) {
+            tracing::warn!(%error, "a replaced file of remote write cannot be used: the previous one remains in use");
         }
     }
 
@@ -379,4 +403,39 @@ impl Sender<'_> {
 /// Returns the number of samples.
 fn samples(part: &[Arc<Scrape>]) -> u64 {
     part.iter().map(|scrape| scrape.samples.len() as u64).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_age_of_waiting_samples_falls_while_a_queue_on_disk_is_drained() {
+        let directory = tempfile::tempdir().unwrap();
+        let (waiting, figures) = (Waiting::default(), Figures::default());
+        waiting.state().backlog.open(directory.path(), 4 << 20);
+        let begin = now() - 200_000;
+        let scrape = |number: i64| Scrape {
+            at: begin + number * 1_000,
+            samples: vec![(vec![b'g', b'a', 0xff].into(), 0.0)],
+        };
+        for number in 0..150 {
+            waiting.change(&figures, |state| {
+                state.backlog.add(scrape(number), false);
+            });
+        }
+        // The receiver is in reach again. Sixty collections are in a request, and others follow.
+        for (expected, later) in [(200.0, 150), (140.0, 151), (80.0, 152), (50.0, 153)] {
+            let batch = waiting.take(&figures).unwrap();
+            assert!(!batch.is_empty());
+            let seen = figures.lag_seconds();
+            assert!((expected..expected + 10.0).contains(&seen), "{seen}");
+            waiting.change(&figures, |state| {
+                state.backlog.add(scrape(later), true);
+            });
+            waiting.settled();
+            let seen = figures.lag_seconds();
+            assert!((expected..expected + 10.0).contains(&seen), "{seen}");
+        }
+    }
 }

@@ -50,6 +50,9 @@ pub(super) enum Cause {
 struct TriggerData {
     /// Name of the snapshot in the configuration.
     snapshot: String,
+    /// Place in the order of the snapshot's bags; zero for bags of earlier versions.
+    #[serde(default)]
+    number: u64,
     /// Name of the trigger, `request` or `signal`.
     trigger: String,
     /// Name of the event that met the trigger.
@@ -71,6 +74,8 @@ struct TriggerData {
 pub struct TriggeredBag {
     /// Name of the snapshot in the configuration.
     pub snapshot: String,
+    /// Place in the order of the snapshot's bags; zero for bags of earlier versions.
+    pub number: u64,
     /// The event.
     pub trigger: BagTrigger,
 }
@@ -97,6 +102,7 @@ impl TriggeredBag {
                 time: data.time?,
             },
             snapshot: data.snapshot,
+            number: data.number,
         })
     }
 }
@@ -155,7 +161,7 @@ impl Cause {
         }
     }
 
-    fn data(&self, snapshot: &str) -> TriggerData {
+    fn data(&self, snapshot: &str, number: u64) -> TriggerData {
         let record = match self {
             Self::Event { record, .. } => Some(record),
             Self::Request | Self::Signal => None,
@@ -168,6 +174,7 @@ impl Cause {
         });
         TriggerData {
             snapshot: snapshot.to_owned(),
+            number,
             trigger: self.name().to_owned(),
             event: record.map(|record| record.definition.name.to_owned()),
             event_id: self.event_id().map(str::to_owned),
@@ -198,14 +205,20 @@ impl SnapshotBag {
         };
         let needed = needed + CLOSING_BYTES;
         let others = settings.max_count - usize::from(cause.event_id().is_some());
-        let Space { bytes, removed } = make_space(&directory, settings, others, needed, |bag| {
+        let space = make_space(&directory, settings, others, needed, |bag| {
             recordings.may_remove(bag)
         });
+        let Space {
+            bytes,
+            removed,
+            number,
+        } = space;
         if bytes < needed {
             return Err(failed(cause, no_space(settings).to_string(), removed));
         }
         let topics = Topics::default();
-        match recorder(recordings, settings, &directory, &cause, &topics) {
+        let data = cause.data(&settings.name, number);
+        match recorder(recordings, settings, &directory, &data, &topics) {
             Ok(recorder) => Ok(Self {
                 recorder,
                 cause,
@@ -313,7 +326,7 @@ fn recorder(
     recordings: &Recordings,
     settings: &SnapshotSettings,
     directory: &Path,
-    cause: &Cause,
+    data: &TriggerData,
     topics: &Topics,
 ) -> Result<Recorder<'static>, Refusal> {
     let filter = Filter::new(FilterOptions {
@@ -325,7 +338,7 @@ fn recorder(
     let quota = recordings.quota(directory);
     quota.check().map_err(|error| refusal(name, error))?;
     // Texts and numbers cannot fail to serialize.
-    let data = serde_json::to_string(&cause.data(name)).unwrap_or_default();
+    let data = serde_json::to_string(data).unwrap_or_default();
     let options = Options {
         custom_data: BTreeMap::from([(TRIGGER_DATA.to_owned(), data)]),
         ..Options::default()

@@ -15,11 +15,14 @@ pub(super) struct Space {
     pub(super) bytes: u64,
     /// Number of bags that were removed for the new one.
     pub(super) removed: u64,
+    /// Number of the new bag. That of each earlier one is lower, whatever the clock was.
+    pub(super) number: u64,
 }
 
 struct KeptBag {
     path: PathBuf,
     bytes: u64,
+    number: u64,
     modified: SystemTime,
 }
 
@@ -35,8 +38,10 @@ pub(super) fn make_space(
 ) -> Space {
     let limit = settings.max_total_bytes;
     let (mut triggered, mut used) = kept(new, settings);
+    let last = triggered.iter().map(|bag| bag.number).max();
     triggered.retain(|bag| may_remove(&bag.path));
-    triggered.sort_by_key(|bag| bag.modified);
+    // Bags of earlier versions have no number.
+    triggered.sort_by_key(|bag| (bag.number, bag.modified));
     let mut count = triggered.len();
     let mut removed = 0;
     // Nothing is removed for a bag that cannot fit.
@@ -61,6 +66,7 @@ pub(super) fn make_space(
     Space {
         bytes: limit.saturating_sub(used),
         removed,
+        number: last.unwrap_or(0).saturating_add(1),
     }
 }
 
@@ -79,11 +85,13 @@ fn kept(new: &Path, settings: &SnapshotSettings) -> (Vec<KeptBag>, u64) {
         }
         let bytes = bytes_of(&path);
         used = used.saturating_add(bytes);
-        if TriggeredBag::read(&path).is_some_and(|bag| bag.snapshot == settings.name) {
+        let bag = TriggeredBag::read(&path).filter(|bag| bag.snapshot == settings.name);
+        if let Some(bag) = bag {
             let modified = entry.metadata().and_then(|entry| entry.modified());
             triggered.push(KeptBag {
                 path,
                 bytes,
+                number: bag.number,
                 modified: modified.unwrap_or(SystemTime::UNIX_EPOCH),
             });
         }

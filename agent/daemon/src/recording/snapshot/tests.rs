@@ -605,6 +605,33 @@ fn a_bag_that_was_not_delivered_is_never_removed_for_others() {
 }
 
 #[test]
+fn bags_of_a_clock_that_was_ahead_are_the_oldest_ones() {
+    let mut robot = Robot::new(SnapshotSettings {
+        max_count: 2,
+        ..settings(&["message_lost"], 1, 0)
+    });
+    robot.run(20);
+    let incident = |robot: &mut Robot| {
+        let before = robot.bags();
+        robot.lose_messages();
+        robot.run(1);
+        let mut bags = robot.bags().into_keys();
+        bags.find(|bag| !before.contains_key(bag)).unwrap()
+    };
+    let ahead = [incident(&mut robot), incident(&mut robot)];
+    let future = SystemTime::now() + Duration::from_secs(86_400);
+    for bag in &ahead {
+        let bag = std::fs::File::open(robot.directory.path().join(bag)).unwrap();
+        bag.set_modified(future).unwrap();
+    }
+    let third = incident(&mut robot);
+    let fourth = incident(&mut robot);
+    let mut expected = vec![third, fourth];
+    expected.sort();
+    assert!(robot.bags().into_keys().eq(expected));
+}
+
+#[test]
 fn a_bag_with_an_oversized_metadata_file_is_kept() {
     let mut robot = Robot::new(SnapshotSettings {
         max_count: 1,

@@ -1,11 +1,13 @@
 //! `/history`: what the agent keeps on disk of the last days, and the robot as it was at a moment.
 
+mod event_range;
 mod query;
 mod rates;
 mod topic;
 mod writer;
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use axum::Json;
 use axum::extract::State;
@@ -23,6 +25,7 @@ use super::processes::MAX_PROCESSES;
 use ros2probe_api::history::{DiskHistory, HistorySpan, ProcessColumns, ProcessHistory};
 use ros2probe_history::{ProcessName, ProcessRow, Span, Store, merge_by_name};
 
+use event_range::EventRange;
 pub(super) use query::TopicRange;
 use query::{TimeRange, read_store};
 pub(super) use topic::show as show_topic;
@@ -169,7 +172,8 @@ async fn processes(
 
 /// The events of a time
 ///
-/// Each line is an event, as in `/events`. If they are more than 8 MiB, the latest are missing.
+/// Each line is an event, as in `/events`, also one that is not on disk yet. If they are more than
+/// 8 MiB, the latest are missing.
 #[utoipa::path(
     get,
     path = "/history/events",
@@ -189,13 +193,17 @@ async fn events(
     Parameters(range): Parameters<TimeRange>,
 ) -> Result<Response, Problem> {
     let range = range.checked(query::now(&context))?;
+    let log = Arc::clone(&context.events);
     let text = read_store(&context, move |store| {
         let mut text = Vec::new();
-        store.events(range.times(), &mut |lines| {
+        let mut add = |lines: &[u8]| {
             if text.len() + lines.len() <= MAX_EVENT_BYTES {
                 text.extend_from_slice(lines);
             }
-        });
+        };
+        let mut selected = EventRange::new(&log, range);
+        store.events(range.times(), &mut |lines| add(&selected.of_block(lines)));
+        add(&selected.unwritten());
         text
     });
     Ok(lines_of(text.await?))

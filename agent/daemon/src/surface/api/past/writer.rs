@@ -33,6 +33,8 @@ const PROCESS_READS_PER_WRITE: u32 = 60;
 const PUBLICATION_TIMEOUT: Duration = Duration::from_secs(2);
 /// Number of these times after which an old state is written.
 const MAX_PUBLICATION_TIMEOUTS: u32 = 10;
+/// Gap between two seconds that is a step of the clock.
+const CLOCK_STEP_SECONDS: u32 = 600;
 /// Number of events read at once.
 const EVENT_BATCH: usize = 512;
 /// Maximum length of the events of a minute, in bytes.
@@ -257,7 +259,9 @@ impl Minute {
         let first = first.map_or(now, |first| seconds(first.at));
         // After a step back of the clock, the ring begins again.
         let last = Some(self.written).filter(|written| *written <= now);
-        last.unwrap_or(0).max(first.saturating_sub(1))
+        let begin = last.unwrap_or(0).max(first.saturating_sub(1));
+        let all = past.seconds().iter().map(|second| seconds(second.at));
+        after_gap(begin, all.filter(|at| *at > begin))
     }
 }
 
@@ -277,6 +281,19 @@ impl EventLines {
 fn append(store: &Store, blocks: &[Block], now: u32) -> io::Result<()> {
     store.append(Tier::Seconds, blocks)?;
     store.condense(now)
+}
+
+/// Returns the time after which new seconds follow each other. A block across a step of the clock
+/// would cover the years in between.
+fn after_gap(begin: u32, new: impl Iterator<Item = u32>) -> u32 {
+    let (mut begin, mut last) = (begin, begin);
+    for at in new {
+        if at.saturating_sub(last) > CLOCK_STEP_SECONDS {
+            begin = at.saturating_sub(1);
+        }
+        last = at;
+    }
+    begin
 }
 
 /// Returns the rows of each topic that end after `begin`.
@@ -335,6 +352,16 @@ fn saturated(value: u64) -> u32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_block_begins_after_the_last_step_of_the_clock() {
+        let year = 1_790_000_000;
+        assert_eq!(after_gap(100, 101..=160), 100);
+        assert_eq!(after_gap(100, [103, 700].into_iter()), 100);
+        assert_eq!(after_gap(100, year..year + 60), year - 1);
+        assert_eq!(after_gap(100, (101..130).chain(year..year + 30)), year - 1);
+        assert_eq!(after_gap(100, std::iter::empty()), 100);
+    }
 
     #[test]
     fn events_beyond_the_cap_of_a_minute_are_left_out() {
