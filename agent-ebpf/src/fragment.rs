@@ -124,7 +124,8 @@ fn first(skb: *mut __sk_buff, slot: u32, mut scratch: Working<Scratch>, flow: &F
     }
     let begun = scratch.get();
     begun.walk.record.datagram = flow.token.get();
-    // Fragments that arrived before the first one were captured, so the others are, too.
+    // Fragments that arrived before the first one were captured within the budget, so the others
+    // are captured, too.
     let alone = flow.seen.get() == begun.packet.len;
     let (base, present) = (begun.packet.body + 8, begun.packet.len - 8);
     let result = if alone {

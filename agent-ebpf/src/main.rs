@@ -86,8 +86,8 @@ pub fn host_egress(context: SkBuffContext) -> i32 {
     1
 }
 
-/// Runs in addition to [`host_ingress`], for TCP segments of Zenoh. Linux may merge several
-/// segments of a connection into one packet.
+/// Runs in addition to [`host_ingress`], for TCP segments, which may carry Zenoh or RTPS. Linux may
+/// merge several segments of a connection into one packet.
 #[cgroup_skb(ingress)]
 pub fn zenoh_ingress(context: SkBuffContext) -> i32 {
     zenoh::socket(context.skb.skb, hook::INGRESS);

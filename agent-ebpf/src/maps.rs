@@ -27,8 +27,8 @@ use crate::{
 /// the kernel refuses the program.
 const NO_PREALLOC: u32 = 1;
 
-/// Maximum number of records that the filter writes for one datagram; a datagram with more is
-/// captured.
+/// Maximum number of records that the filter writes for one frame, or for one datagram at a
+/// socket. A datagram with more is captured, if the ring has room for it.
 pub const RECORDS_PER_DATAGRAM: u32 = 32;
 const _: () = assert!(RECORDS_PER_DATAGRAM.is_power_of_two());
 
@@ -104,10 +104,12 @@ pub static RECORDS: RingBuf = RingBuf::with_byte_size(256 * 1024, 0);
 #[map]
 pub static COUNTERS: PerCpuArray<[[u64; Counter::ALL.len()]; COUNTER_SLOTS]> =
     PerCpuArray::with_max_entries(1, 0);
-/// Captured datagrams of the host hook, in [`PieceBuffer`]s cut to their length.
+/// Captured datagrams and messages in pieces, and chunks of TCP connections: [`PieceBuffer`]s cut
+/// to their length.
 #[map]
 pub static PIECES: RingBuf = RingBuf::with_byte_size(1024 * 1024, 0);
-/// Sockets that the host hook has seen, by cookie.
+/// Sockets with captured or metered datagrams, and sockets of recognized TCP connections, by
+/// cookie.
 #[map]
 pub static SOCKETS: LruHashMap<u64, Socket> = LruHashMap::with_max_entries(SOCKET_CAPACITY, 0);
 /// Keys that are too large for the stack, by slot.
@@ -269,7 +271,7 @@ pub struct Scratch {
     pub pending: Record,
     /// Number of filled elements of `records`.
     pub count: u32,
-    /// Whether user space has classified the endpoint of the last one of `records`.
+    /// Whether user space has classified the endpoint that was looked up last.
     pub classified: u32,
     /// Whether the capture is needed only for an unclassified writer.
     pub unknown: u32,

@@ -2,7 +2,8 @@
 //! when user space reads the list.
 //!
 //! It writes one `host::Owner` for every file that is a socket with a cookie. A socket gets its
-//! cookie when a program first reads it, as the host hook does for every socket that it sees.
+//! cookie when a program first reads the cookie. The programs at the sockets do so for RTPS
+//! datagrams and for TCP segments with payload.
 
 use aya_ebpf::helpers::generated::bpf_seq_write;
 use ros2probe_wire::host::{Layout, Owner};

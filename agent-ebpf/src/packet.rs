@@ -182,7 +182,7 @@ fn ipv4(header: [u32; 5], start: u32, packet: &mut Packet) -> Option<()> {
     Some(())
 }
 
-/// Reads an IPv6 header (RFC 8200) with up to eight extension headers.
+/// Reads an IPv6 header (RFC 8200) with up to seven extension headers.
 #[inline(always)]
 fn ipv6(skb: *mut __sk_buff, start: u32, packet: &mut Packet) -> Option<()> {
     let header: [u32; 10] = load(skb, start)?;

@@ -89,7 +89,8 @@ impl walk::Bytes for Linear {
 /// Why a packet was dropped.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Why {
-    /// The kernel timed out waiting for fragments.
+    /// The reassembly failed: fragments were missing at the timeout, or too many other datagrams
+    /// arrived in between (`FRAG_TOO_FAR`).
     GaveUp,
     /// Another reason, or an unspecified one.
     Other,
@@ -310,7 +311,7 @@ fn ipv4(ip: u64, this: &mut Incomplete) -> Option<()> {
     Some(())
 }
 
-/// Reads an IPv6 header (RFC 8200); the fragment header follows up to four extension headers.
+/// Reads an IPv6 header (RFC 8200). Up to three extension headers may precede the fragment header.
 #[inline(always)]
 fn ipv6(ip: u64, this: &mut Incomplete) -> Option<()> {
     let header: [u32; 10] = read(ip)?;

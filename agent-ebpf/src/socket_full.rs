@@ -1,10 +1,9 @@
 //! Datagrams dropped at a socket because its receive buffer was full.
 //!
 //! Directly before the drop, on the same CPU and for the same socket, the host hook has read the
-//! datagram and stored its findings. So this module parses no RTPS, and works alike on every
-//! kernel. Where the kernel's types are known, it compares the socket. Then it never takes an
-//! unseen datagram (other traffic, a socket outside the hook's cgroup) for one that the hook has
-//! seen.
+//! datagram and stored its findings. So this module parses no RTPS. Where the kernel's types are
+//! known, it compares the socket. Then it never takes an unseen datagram (other traffic, a socket
+//! outside the hook's cgroup) for one that the hook has seen.
 //!
 //! Before Linux 6.6 the kernel reports a full buffer for IPv4 only. On such kernels this module
 //! observes all freed packets, and recognizes the one that the hook has just seen.
@@ -68,8 +67,8 @@ pub fn freed(context: &RawTracePointContext) {
     }
 }
 
-/// `kfree_skb(skb, location)`, for IPv6. Without the kernel's types, only the immediate drop
-/// identifies the packet.
+/// `kfree_skb(skb, location)`, for IPv6. Without the kernel's types, the packet is identified by
+/// its address and by the immediate drop.
 #[inline(always)]
 pub fn unexplained(context: &RawTracePointContext) {
     let buffer: u64 = context.arg(0);
@@ -139,7 +138,8 @@ fn tell(last: &Last) {
     undelivered(last.slot.get(), last.token.get(), last.captured.get());
 }
 
-/// Writes the records that the hook left in `slot` again, marked as not delivered.
+/// Writes the hook's records of the datagram again, marked as not delivered. If the datagram was
+/// captured, writes one record of kind UNDELIVERED instead.
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn undelivered(slot: u32, token: u32, captured: u32) -> u32 {

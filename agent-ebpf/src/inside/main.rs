@@ -3,7 +3,8 @@
 //! `rcl`, `rclcpp` and the middlewares call a function of this library for each event, whether a
 //! tracer is installed or not. A uprobe at the entry of that function runs in the calling process.
 //! The programs read arguments and, once for each handle, names; they write only their own maps. No
-//! data leaves the kernel for each message, except a bounded number of causal publications.
+//! data leaves the kernel for each message, except bounded numbers of causal publications and late
+//! calls.
 //!
 //! The programs use only what the verifier of Linux 5.10 accepts, as the packet filter does.
 

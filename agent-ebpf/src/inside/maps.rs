@@ -43,7 +43,7 @@ static NEW_THREAD: Array<Thread> = Array::with_max_entries(1, 0);
 /// Times at which messages entered ring buffers.
 #[map]
 pub static WAITING: LruHashMap<Entry, u64> = LruHashMap::with_max_entries(WAITING_CAPACITY, 0);
-/// Names and relations of handles, and causal publications.
+/// Names and relations of handles, causal publications and late calls.
 #[map]
 pub static ANNOUNCEMENTS: RingBuf = RingBuf::with_byte_size(512 * 1024, 0);
 /// Differences of other clocks to CLOCK_MONOTONIC in nanoseconds, by `inside::clock`. Set by user

@@ -192,8 +192,8 @@ fn is_endpoint(rmw: u64) -> bool {
     read::<u32>(read(rmw)) == RMW && read::<u8>(read(rmw + TOPIC_NAME)) == b'/'
 }
 
-/// Returns whether an address holds an endpoint of a middleware with any name. The caller has
-/// excluded names that begin with a slash.
+/// Returns whether an address holds an endpoint of a middleware with a name that is not empty. The
+/// caller has excluded names that begin with a slash.
 #[inline(always)]
 fn is_internal(rmw: u64) -> bool {
     read::<u32>(read(rmw)) == RMW && read::<u8>(read(rmw + TOPIC_NAME)) != 0

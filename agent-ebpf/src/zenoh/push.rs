@@ -26,7 +26,7 @@ const LABELLED: [u32; 2] = [77, 61];
 const GID: u32 = 16;
 
 /// Reads the PUSH at the reader's position and sets `wanted`. In a FRAME, `wanted` is set only if
-/// nothing follows the PUSH.
+/// nothing follows the PUSH, or if its header exceeds the window.
 #[inline(always)]
 pub fn read(slot: u32, in_frame: bool) -> Option<()> {
     let Some(mut this) = segment(slot) else {

@@ -25,15 +25,15 @@ use super::{
     state::{WINDOW, Window, segment},
 };
 
-/// Maximum number of submessages before a sample: INFO_DST and INFO_TS.
+/// Maximum number of submessages that are examined: INFO_DST, INFO_TS and a sample.
 const BEFORE: u32 = 3;
 /// Offset of the first submessage in a frame.
 const SUBMESSAGES: u32 = HEADER_LEN as u32 + walk::HEADER_LEN;
 /// Maximum number of bytes after the first sample that are left out: INFO_DST, a HEARTBEAT and Fast
 /// DDS's own submessage for statistics.
 const REST: u32 = 128;
-/// Maximum length of a frame of a known writer that is passed on as a whole, unless its topic is
-/// ignored. It may have several samples.
+/// Frames of known writers up to this length are passed on as a whole, because they may have
+/// several samples. A frame whose only sample is ignored is skipped.
 const SMALL: u32 = 1024;
 /// The bits of an entity kind that mark a built-in entity (RTPS 2.5, 9.3.1.2).
 const BUILT_IN: u32 = 0xc0;

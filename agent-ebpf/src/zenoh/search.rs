@@ -110,7 +110,8 @@ pub extern "C" fn at_socket(skb: *mut __sk_buff, slot: u32) -> u32 {
     }
 }
 
-/// Searches as [`at_socket`] does, on an interface. Returns 1 if the connection is of Zenoh.
+/// Searches as [`at_socket`] does, on an interface. Returns 1 if the connection carries Zenoh or
+/// RTPS.
 #[unsafe(export_name = "zenoh_on_interface")]
 #[inline(never)]
 pub extern "C" fn on_interface(skb: *mut __sk_buff, slot: u32) -> u32 {

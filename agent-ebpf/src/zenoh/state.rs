@@ -1,4 +1,4 @@
-//! Maps of the connections of Zenoh, and the working memory of a run.
+//! Maps of the TCP connections of Zenoh and RTPS, and the working memory of a run.
 
 use aya_ebpf::{
     helpers::generated::bpf_jiffies64,
@@ -23,7 +23,7 @@ pub const WINDOW: u32 = 512;
 #[unsafe(no_mangle)]
 pub static ZENOH_PORTS: [u16; PORT_CAPACITY] = [7447, 0, 0, 0, 0, 0, 0, 0];
 
-/// Directions of connections of Zenoh.
+/// Directions of recognized TCP connections: of Zenoh, of RTPS, and of TLS on a port of Zenoh.
 #[map]
 pub static CONNECTIONS: LruHashMap<Key, Direction> =
     LruHashMap::with_max_entries(CONNECTION_CAPACITY, 0);
