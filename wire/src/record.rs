@@ -77,7 +77,8 @@ pub mod flag {
     /// samples were not sent.
     pub const EXACT: u16 = 1 << 10;
     /// A TCP connection of Zenoh carried the sample: a copy is for another receiver, never a
-    /// repetition. In a [`crate::host::Piece`]: the piece is a chunk of such a connection.
+    /// repetition. In a [`crate::host::Piece`]: the piece is a chunk of a TCP connection, or the
+    /// head of a QUIC datagram.
     pub const STREAM: u16 = 1 << 11;
     /// With [`STREAM`]: the sample was sent to a router, which forwards it and is not a subscriber.
     pub const RELAYED: u16 = 1 << 12;
