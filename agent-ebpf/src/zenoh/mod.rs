@@ -1,11 +1,17 @@
-//! Selects the bytes of Zenoh's TCP connections that user space needs.
+//! Selects the bytes of TCP connections of Zenoh and RTPS that user space needs.
 //!
-//! At the sockets ([`socket`]) each direction of a connection is followed from batch to batch. Only
-//! the head of a sample is passed on, but declarations as a whole. On interfaces ([`frame`]) whole
-//! frames are kept. At both hooks a connection is found by its first batch, or by batches with
-//! consecutive sequence numbers ([`search`]). Of QUIC connections only the first packets are
-//! recognized ([`quic`]). No byte of other connections is passed on, and few of their bytes are
-//! read.
+//! At both hooks a connection is recognized by its first batch or frame, or by batches with
+//! consecutive sequence numbers ([`search`]). At the sockets ([`socket`]) each direction of such a
+//! connection is followed from batch to batch. Only the head of a sample is passed on, but
+//! declarations as a whole. On interfaces ([`frame`]) whole frames are kept.
+//!
+//! The bytes of a connection that is not recognized stay in the kernel, except on configured ports
+//! of Zenoh:
+//!
+//! - At a socket, these bytes are passed on: the first 16 of a hello of TLS, and the first 512 of
+//!   an INIT of another version of Zenoh. Of each Initial packet of QUIC ([`quic`]), 6 bytes are.
+//! - On an interface, every TCP frame with payload, SYN, FIN or RST is kept as a whole, of any
+//!   protocol. So is every datagram with an Initial packet of QUIC.
 
 mod chunk;
 mod follow;
