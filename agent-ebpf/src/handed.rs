@@ -265,7 +265,7 @@ pub extern "C" fn shm_walk(slot: u32, len: u32) -> u32 {
     progress::CAPTURE
 }
 
-/// Walks one submessage, as `verdict::advance` does.
+/// Walks one submessage. Unlike in `verdict::advance`, a split submessage ends the walk.
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn shm_advance(slot: u32, len: u32) -> u32 {

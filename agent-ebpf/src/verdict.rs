@@ -76,7 +76,7 @@ pub extern "C" fn whole(skb: *mut __sk_buff, slot: u32) -> u32 {
     0
 }
 
-/// Walks a datagram again that did not fit the ring, as if a copy had been captured. Its
+/// Walks the datagram again after the ring had no room for it, as if it were captured. Its
 /// submessages of interest become records.
 #[unsafe(no_mangle)]
 #[inline(never)]

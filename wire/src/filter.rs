@@ -79,7 +79,7 @@ pub enum Counter {
     ZenohChunksLost,
     /// Zenoh: losses of the boundary between batches, for example after reordered TCP segments.
     ZenohGaps,
-    /// Zenoh: directions of other TCP connections with a segment that looked like a batch.
+    /// Zenoh: unrecognized directions of TCP connections with a segment that looked like a batch.
     ZenohCandidates,
     /// Zenoh: directions of connections that were recognized.
     ZenohConnections,

@@ -141,7 +141,7 @@ fn sample(slot: u32, writer: [u32; 4], is_alone: u32) -> u32 {
         Some(_) if is_needed => {}
         Some(CAPTURE) if !is_repeated => this.wakes = 1,
         Some(_) => this.wanted = WINDOW,
-        // Its announcement may still be on its way.
+        // The writer's announcement may still be in transit.
         None if !is_repeated && charge_unknown(&writer, this.total) => this.wakes = 1,
         None => {
             this.wanted = if this.total < WINDOW {

@@ -268,7 +268,7 @@ impl Window {
         piece(slot).map(|buffer| Self(buffer.bytes.as_ptr()))
     }
 
-    /// Returns the byte at `at`; `None` at `end` and after it.
+    /// Returns the byte at `at`; `None` if `at` is not below `end`.
     #[inline(always)]
     pub fn byte(self, at: u32, end: u32) -> Option<u32> {
         if at >= end || at >= WINDOW {
