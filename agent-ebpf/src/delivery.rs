@@ -1,11 +1,11 @@
 //! Deliveries of messages through the sockets of this host, while a client requests causes of late
 //! calls.
 //!
-//! [`passed`] numbers the datagrams of each socket just before they enter its receive buffer.
-//! [`received`] runs when a thread has received one. The buffer is a queue: the number of that
-//! datagram is the newest number, less the datagrams that are still in the buffer.
-//! A missed drop cannot shift later numbers. A datagram that enters the buffer at the same moment
-//! can hide one delivery, which is then unknown.
+//! [`track_datagram`] numbers the datagrams of each socket just before they enter its receive
+//! buffer. [`on_recvmsg`] runs when a thread has received one. The buffer is a queue: the number of
+//! that datagram is the newest number, less the datagrams that are still in the buffer. A missed
+//! drop cannot shift later numbers. A datagram that enters the buffer at the same moment can hide
+//! one delivery, which is then unknown.
 
 use aya_ebpf::{
     bindings::{__sk_buff, bpf_sock_addr},
@@ -22,9 +22,9 @@ use ros2probe_wire::{
 
 use crate::{
     accounting::{self, Accounting},
-    instructions::add,
-    kernel_memory::{member, place},
-    maps::{count_outside, scratch},
+    instructions::atomic_add,
+    kernel_memory::{layout_entry, read_member},
+    maps::{count_without_slot, scratch},
     packet::hook,
 };
 
@@ -33,10 +33,11 @@ use crate::{
 static FOLLOW_DELIVERIES: Array<u32> = Array::with_max_entries(1, 0);
 /// Sockets that receive datagrams, by cookie.
 #[map]
-static QUEUES: LruHashMap<u64, Queue> = LruHashMap::with_max_entries(QUEUE_CAPACITY, 0);
+static QUEUES: LruHashMap<u64, ReceiveQueue> = LruHashMap::with_max_entries(QUEUE_CAPACITY, 0);
 /// Datagrams in the receive buffers.
 #[map]
-static QUEUED: LruHashMap<QueuedKey, Queued> = LruHashMap::with_max_entries(DELIVERY_CAPACITY, 0);
+static QUEUED: LruHashMap<QueuedDatagramKey, QueuedDatagram> =
+    LruHashMap::with_max_entries(DELIVERY_CAPACITY, 0);
 /// Messages that were received.
 #[map]
 static DELIVERIES: LruHashMap<DeliveryKey, Delivery> =
@@ -48,28 +49,28 @@ static SENT: LruHashMap<u64, u64> = LruHashMap::with_max_entries(DELIVERY_CAPACI
 /// A socket's receive buffer.
 #[repr(C)]
 #[derive(Clone, Copy)]
-struct Queue {
+struct ReceiveQueue {
     /// Number of datagrams so far.
-    count: u64,
+    datagram_count: u64,
     /// Address of the socket, passed through memory to be a plain number.
-    socket: u64,
+    socket_address: u64,
     /// Time of the last receive call, and the accounting of its thread then.
-    received: u64,
+    last_recvmsg_ns: u64,
     accounting: Accounting,
     /// The accounting at the present receive call.
-    after: Accounting,
+    current_accounting: Accounting,
     /// That thread.
-    thread: u64,
-    /// The last time in which the receiving thread waited for a CPU for longer than [`STALL`]: its
-    /// end, and its parts.
-    stall_ended: u64,
+    last_thread: u64,
+    /// The last time in which the receiving thread waited for a CPU for longer than
+    /// [`MIN_STALL_NS`]: its end, and its parts.
+    last_stall_end_ns: u64,
     stall_runnable: u64,
     stall_throttled: u64,
 }
 
 #[repr(C)]
 #[derive(Clone, Copy)]
-struct QueuedKey {
+struct QueuedDatagramKey {
     socket: u64,
     number: u64,
 }
@@ -77,7 +78,7 @@ struct QueuedKey {
 /// A datagram in a receive buffer.
 #[repr(C)]
 #[derive(Clone, Copy)]
-struct Queued {
+struct QueuedDatagram {
     arrived: u64,
     /// Source timestamp of its last sample in nanoseconds; 0 = it has none.
     source_timestamp: u64,
@@ -91,24 +92,24 @@ const NO_ACCOUNTING: Accounting = Accounting {
     throttled: 0,
     voluntary_switches: 0,
 };
-const NEW_QUEUE: Queue = Queue {
-    count: 0,
-    socket: 0,
-    received: 0,
+const EMPTY_RECEIVE_QUEUE: ReceiveQueue = ReceiveQueue {
+    datagram_count: 0,
+    socket_address: 0,
+    last_recvmsg_ns: 0,
     accounting: NO_ACCOUNTING,
-    after: NO_ACCOUNTING,
-    thread: 0,
-    stall_ended: 0,
+    current_accounting: NO_ACCOUNTING,
+    last_thread: 0,
+    last_stall_end_ns: 0,
     stall_runnable: 0,
     stall_throttled: 0,
 };
 
 /// Minimum wait for a CPU, in nanoseconds, to which the waits of several datagrams are attributed.
-const STALL: u64 = 500_000;
+const MIN_STALL_NS: u64 = 500_000;
 
 /// Returns whether deliveries are followed.
 #[inline(always)]
-pub fn are_followed() -> bool {
+pub fn is_tracking_enabled() -> bool {
     match FOLLOW_DELIVERIES.get_ptr(0) {
         // SAFETY: a map value pointer checked against null.
         Some(followed) => unsafe { core::ptr::read_volatile(followed) != 0 },
@@ -119,7 +120,7 @@ pub fn are_followed() -> bool {
 /// Handles a datagram that passes the host hook; `at` is one of [`hook`].
 #[unsafe(no_mangle)]
 #[inline(never)]
-pub extern "C" fn passed(skb: *mut __sk_buff, slot: u32, at: u32) -> u32 {
+pub extern "C" fn track_datagram(skb: *mut __sk_buff, slot: u32, at: u32) -> u32 {
     let Some(mut scratch) = scratch(slot) else {
         return 0;
     };
@@ -129,14 +130,14 @@ pub extern "C" fn passed(skb: *mut __sk_buff, slot: u32, at: u32) -> u32 {
         0 => (0, 0),
         _ => (
             u64::from(walk.record.source_port),
-            nanoseconds(walk.timestamp),
+            rtps_time_to_ns(walk.timestamp),
         ),
     };
     // SAFETY: no preconditions.
     let now = unsafe { bpf_ktime_get_ns() };
     if at != hook::INGRESS {
         if source_timestamp != 0 {
-            sent(source_timestamp, now);
+            note_send_time(source_timestamp, now);
         }
         return 0;
     }
@@ -147,7 +148,7 @@ pub extern "C" fn passed(skb: *mut __sk_buff, slot: u32, at: u32) -> u32 {
         // Only sockets that receive RTPS are of interest.
         None if port == 0 => return 0,
         None => {
-            let _ = QUEUES.insert(&socket, &NEW_QUEUE, 0);
+            let _ = QUEUES.insert(&socket, &EMPTY_RECEIVE_QUEUE, 0);
             match QUEUES.get_ptr_mut(&socket) {
                 Some(queue) => queue,
                 None => return 0,
@@ -155,40 +156,40 @@ pub extern "C" fn passed(skb: *mut __sk_buff, slot: u32, at: u32) -> u32 {
         }
     };
     // SAFETY: a map value pointer checked against null.
-    let number = unsafe { core::ptr::read_volatile(&raw const (*queue).count) };
-    let queued = Queued {
+    let number = unsafe { core::ptr::read_volatile(&raw const (*queue).datagram_count) };
+    let queued = QueuedDatagram {
         arrived: now,
         source_timestamp,
         port,
     };
-    let _ = QUEUED.insert(&QueuedKey { socket, number }, &queued, 0);
+    let _ = QUEUED.insert(&QueuedDatagramKey { socket, number }, &queued, 0);
     // SAFETY: as above.
-    add(unsafe { &raw mut (*queue).count }, 1);
+    atomic_add(unsafe { &raw mut (*queue).datagram_count }, 1);
     0
 }
 
 /// Takes back the number of a datagram that the receive buffer refused.
 #[inline(always)]
-pub fn refused(socket: u64) {
-    if are_followed()
+pub fn uncount_dropped_datagram(socket: u64) {
+    if is_tracking_enabled()
         && let Some(queue) = QUEUES.get_ptr_mut(&socket)
     {
         // SAFETY: a map value pointer checked against null.
-        add(unsafe { &raw mut (*queue).count }, u64::MAX);
+        atomic_add(unsafe { &raw mut (*queue).datagram_count }, u64::MAX);
     }
 }
 
 /// Notes when a message was first sent.
 #[inline(always)]
-fn sent(source_timestamp: u64, now: u64) {
-    const NO_EXIST: u64 = 1;
-    let _ = SENT.insert(&source_timestamp, &now, NO_EXIST);
+fn note_send_time(source_timestamp: u64, now: u64) {
+    const BPF_NOEXIST: u64 = 1;
+    let _ = SENT.insert(&source_timestamp, &now, BPF_NOEXIST);
 }
 
 /// Handles the end of a receive call.
 #[inline(always)]
-pub fn received(context: *mut bpf_sock_addr) {
-    if !are_followed() {
+pub fn on_recvmsg(context: *mut bpf_sock_addr) {
+    if !is_tracking_enabled() {
         return;
     }
     // SAFETY: the program's context.
@@ -200,44 +201,44 @@ pub fn received(context: *mut bpf_sock_addr) {
     let now = unsafe { bpf_ktime_get_ns() };
     // SAFETY: as above. The verifier rewrites reads of the context.
     let (address, port) = unsafe {
-        let address = &raw mut (*queue).socket;
+        let address = &raw mut (*queue).socket_address;
         core::ptr::write_volatile(address, (*context).__bindgen_anon_1.sk as u64);
         (core::ptr::read_volatile(address), (*context).user_port)
     };
     // SAFETY: a map value, as above.
     unsafe {
-        let is_known = accounting::read_into(&raw mut (*queue).after) != 0;
+        let has_accounting = accounting::read_accounting(&raw mut (*queue).current_accounting) != 0;
         let port = u16::from_be(port as u16);
-        if note(queue, socket, address, port, now, is_known).is_none() {
-            count_outside(Counter::ReceivedUnmatched, 1);
+        if note_delivery(queue, socket, address, port, now, has_accounting).is_none() {
+            count_without_slot(Counter::ReceivedUnmatched, 1);
         }
-        (*queue).received = 0;
-        if is_known {
-            (*queue).accounting = (*queue).after;
-            (*queue).thread = bpf_get_current_pid_tgid();
-            (*queue).received = now;
+        (*queue).last_recvmsg_ns = 0;
+        if has_accounting {
+            (*queue).accounting = (*queue).current_accounting;
+            (*queue).last_thread = bpf_get_current_pid_tgid();
+            (*queue).last_recvmsg_ns = now;
         }
     }
 }
 
 /// Notes the delivery of the received datagram; `None` if it is not known which one that is.
-/// `is_known`: whether the accounting of the running thread is.
+/// `has_accounting`: whether the accounting of the running thread is known.
 #[inline(always)]
-unsafe fn note(
-    queue: *mut Queue,
+unsafe fn note_delivery(
+    queue: *mut ReceiveQueue,
     socket: u64,
     address: u64,
     port: u16,
     now: u64,
-    is_known: bool,
+    has_accounting: bool,
 ) -> Option<()> {
     // SAFETY: a map value, by the caller.
-    let count = unsafe { core::ptr::read_volatile(&raw const (*queue).count) };
-    let number = count.checked_sub(1 + waiting(address)?)?;
-    let key = QueuedKey { socket, number };
+    let count = unsafe { core::ptr::read_volatile(&raw const (*queue).datagram_count) };
+    let number = count.checked_sub(1 + queue_len(address)?)?;
+    let key = QueuedDatagramKey { socket, number };
     // SAFETY: the memory of an LRU entry stays valid. An entry is written once, unless two CPUs
     // numbered datagrams at the same moment.
-    let Queued {
+    let QueuedDatagram {
         arrived,
         source_timestamp,
         port: expected,
@@ -259,26 +260,34 @@ unsafe fn note(
     };
     // SAFETY: a map value, by the caller.
     unsafe {
-        let since = (*queue).received;
-        if is_known && since != 0 && now > since && (*queue).thread == thread {
-            let before = &raw const (*queue).accounting;
-            let states = accounting::states(before, &(*queue).after, now - since);
+        let previous_recvmsg_ns = (*queue).last_recvmsg_ns;
+        if has_accounting
+            && previous_recvmsg_ns != 0
+            && now > previous_recvmsg_ns
+            && (*queue).last_thread == thread
+        {
+            let previous_accounting = &raw const (*queue).accounting;
+            let states = accounting::states(
+                previous_accounting,
+                &(*queue).current_accounting,
+                now - previous_recvmsg_ns,
+            );
             let mut throttled = states[thread_state::THROTTLED];
             let mut runnable = states[thread_state::RUNNABLE];
-            if throttled + runnable > STALL {
-                (*queue).stall_ended = now;
+            if throttled + runnable > MIN_STALL_NS {
+                (*queue).last_stall_end_ns = now;
                 (*queue).stall_runnable = runnable;
                 (*queue).stall_throttled = throttled;
-            } else if (*queue).stall_ended > arrived {
+            } else if (*queue).last_stall_end_ns > arrived {
                 // The datagram arrived during that wait, behind the one that was received then.
-                let during = (*queue).stall_ended - arrived;
-                throttled += accounting::least((*queue).stall_throttled, during);
-                runnable += accounting::least((*queue).stall_runnable, during);
+                let overlap_ns = (*queue).last_stall_end_ns - arrived;
+                throttled += accounting::min((*queue).stall_throttled, overlap_ns);
+                runnable += accounting::min((*queue).stall_runnable, overlap_ns);
             }
             // Both began with an earlier receive call. No part of the delivery is longer than it.
-            let most = now - arrived;
-            delivery.throttled = accounting::least(throttled, most);
-            delivery.runnable = accounting::least(runnable, most - delivery.throttled);
+            let total_wait_ns = now - arrived;
+            delivery.throttled = accounting::min(throttled, total_wait_ns);
+            delivery.runnable = accounting::min(runnable, total_wait_ns - delivery.throttled);
             delivery.accounted = 1;
         }
     }
@@ -293,20 +302,21 @@ unsafe fn note(
 
 /// Returns the number of datagrams in the receive buffer of the socket at `address`.
 #[inline(always)]
-fn waiting(address: u64) -> Option<u64> {
-    if place(Layout::SocketQueue) == Layout::ABSENT || place(Layout::ReaderQueue) == Layout::ABSENT
+fn queue_len(address: u64) -> Option<u64> {
+    if layout_entry(Layout::SocketQueue) == Layout::ABSENT
+        || layout_entry(Layout::ReaderQueue) == Layout::ABSENT
     {
         return None;
     }
     // Readers move all datagrams of the first queue to the second one.
-    let new: u32 = member(address, Layout::SocketQueue)?;
-    let moved: u32 = member(address, Layout::ReaderQueue)?;
-    Some(u64::from(new) + u64::from(moved))
+    let queued: u32 = read_member(address, Layout::SocketQueue)?;
+    let queued_by_reader: u32 = read_member(address, Layout::ReaderQueue)?;
+    Some(u64::from(queued) + u64::from(queued_by_reader))
 }
 
 /// Returns a time of RTPS, seconds and fraction, in nanoseconds. Rounds as user space does.
 #[inline(always)]
-fn nanoseconds([seconds, fraction]: [u32; 2]) -> u64 {
+fn rtps_time_to_ns([seconds, fraction]: [u32; 2]) -> u64 {
     const SECOND: u64 = 1_000_000_000;
     u64::from(seconds) * SECOND + (u64::from(fraction) * SECOND + (1 << 31) >> 32)
 }

@@ -14,8 +14,8 @@ use ros2probe_wire::{
 };
 
 use crate::{
-    instructions::opaque,
-    maps::{FLOWS, Flow, FlowKey, NEW_FLOW, Packet, Scratch, Working, copy, count, scratch},
+    instructions::hide_bounds,
+    maps::{FLOWS, Flow, FlowKey, NEW_FLOW, Packet, Scratch, ScratchRef, copy, count, scratch},
     runs,
     verdict::{self, progress},
 };
@@ -26,7 +26,7 @@ const FLOW_LIFETIME_NANOSECONDS: u64 = 5_000_000_000;
 mod state {
     /// A new flow. Trailing fragments in this state arrived before the first one: the kind of
     /// datagram is unknown, and they are captured within the budget of unclassified writers.
-    pub const HEADLESS: u32 = 0;
+    pub const NO_FIRST_FRAGMENT: u32 = 0;
     /// The datagram is RTPS, and the kernel walks it.
     pub const WALKING: u32 = 1;
     /// All fragments go to user space.
@@ -34,33 +34,33 @@ mod state {
     /// The remaining fragments go to user space.
     pub const HANDED_OVER: u32 = 3;
     /// Not RTPS.
-    pub const FOREIGN: u32 = 4;
+    pub const NOT_RTPS: u32 = 4;
     /// Complete; duplicate fragments change nothing.
-    pub const DONE: u32 = 5;
+    pub const COMPLETE: u32 = 5;
 }
 
 /// Handles one IP fragment; returns 1 to keep the frame.
 #[unsafe(no_mangle)]
 #[inline(never)]
-pub extern "C" fn pass(skb: *mut __sk_buff, slot: u32) -> u32 {
+pub extern "C" fn process_fragment(skb: *mut __sk_buff, slot: u32) -> u32 {
     let Some(mut scratch) = scratch(slot) else {
         return 0;
     };
     count(slot, Counter::Fragments, 1);
     let packet = &mut scratch.get().packet;
     // SAFETY: no preconditions.
-    packet.now = unsafe { bpf_ktime_get_ns() };
+    packet.time_ns = unsafe { bpf_ktime_get_ns() };
     let Some(flow) = flow(slot, packet) else {
         count(slot, Counter::FlowTableFull, 1);
         return 0;
     };
-    let (offset, len, more) = (packet.offset, packet.len, packet.more);
+    let (offset, len, more) = (packet.fragment_offset, packet.len, packet.more_fragments);
     let state = flow.state.get();
-    if state == state::DONE || state == state::FOREIGN && offset != 0 {
+    if state == state::COMPLETE || state == state::NOT_RTPS && offset != 0 {
         return 0;
     }
-    let (word, mask) = (opaque(offset >> 9) & 127, 1_u64 << (offset >> 3 & 63));
-    if let Some(starts) = flow.starts.get(word as usize) {
+    let (word, mask) = (hide_bounds(offset >> 9) & 127, 1_u64 << (offset >> 3 & 63));
+    if let Some(starts) = flow.seen_offsets.get(word as usize) {
         let before = starts.get();
         if before & mask != 0 {
             count(slot, Counter::FragmentsRepeated, 1);
@@ -68,20 +68,20 @@ pub extern "C" fn pass(skb: *mut __sk_buff, slot: u32) -> u32 {
         }
         starts.set(before | mask);
     }
-    let seen = flow.seen.get() + len;
-    flow.seen.set(seen);
+    let seen = flow.received_bytes.get() + len;
+    flow.received_bytes.set(seen);
     if more == 0 {
-        flow.expected.set(offset + len);
+        flow.total_bytes.set(offset + len);
     }
-    let expected = flow.expected.get();
+    let expected = flow.total_bytes.get();
     let complete = expected != 0 && expected == seen;
     let keep = if offset == 0 {
-        first(skb, slot, scratch, flow)
+        process_first_fragment(skb, slot, scratch, flow)
     } else {
-        trailing(skb, slot, scratch, flow)
+        process_later_fragment(skb, slot, scratch, flow)
     };
     if complete {
-        finish(slot, scratch.get(), flow);
+        complete_datagram(slot, scratch.get(), flow);
     }
     keep
 }
@@ -95,135 +95,148 @@ fn flow(slot: u32, packet: &Packet) -> Option<&'static Flow> {
         source: packet.source,
         destination: packet.destination,
         identification: packet.identification,
-        interface: packet.interface | packet.outgoing << 31,
+        interface: packet.interface | packet.is_outgoing << 31,
     };
     // SAFETY: the memory of an LRU entry stays valid when the entry is reused for another key.
     if let Some(flow) = unsafe { FLOWS.get(key) } {
-        let reused = flow.state.get() == state::DONE && packet.offset == 0;
-        if !reused && packet.now.wrapping_sub(flow.born.get()) < FLOW_LIFETIME_NANOSECONDS {
+        let reused = flow.state.get() == state::COMPLETE && packet.fragment_offset == 0;
+        if !reused && packet.time_ns.wrapping_sub(flow.created_ns.get()) < FLOW_LIFETIME_NANOSECONDS
+        {
             return Some(flow);
         }
     }
-    if packet.offset != 0 {
+    if packet.fragment_offset != 0 {
         count(slot, Counter::FragmentsWithoutFlow, 1);
     }
     FLOWS.insert(key, NEW_FLOW.get(0)?, 0).ok()?;
     // SAFETY: as above.
     let flow = unsafe { FLOWS.get(key) }?;
-    flow.born.set(packet.now);
-    flow.token.set(packet.now as u32 | 1);
+    flow.created_ns.set(packet.time_ns);
+    flow.token.set(packet.time_ns as u32 | 1);
     Some(flow)
 }
 
 /// Handles the fragment with the UDP header.
 #[inline(always)]
-fn first(skb: *mut __sk_buff, slot: u32, mut scratch: Working<Scratch>, flow: &Flow) -> u32 {
-    if verdict::begin(skb, slot, scratch.get()).is_none() {
-        flow.state.set(state::FOREIGN);
+fn process_first_fragment(
+    skb: *mut __sk_buff,
+    slot: u32,
+    mut scratch: ScratchRef<Scratch>,
+    flow: &Flow,
+) -> u32 {
+    if verdict::start_walk(skb, slot, scratch.get()).is_none() {
+        flow.state.set(state::NOT_RTPS);
         return 0;
     }
-    let begun = scratch.get();
-    begun.walk.record.datagram = flow.token.get();
-    // Fragments that arrived before the first one were captured, so the others are, too.
-    let alone = flow.seen.get() == begun.packet.len;
-    let (base, present) = (begun.packet.body + 8, begun.packet.len - 8);
-    let result = if alone {
-        verdict::run(skb, base, present, slot)
+    let current = scratch.get();
+    current.walk.record.datagram = flow.token.get();
+    // Fragments that arrived before the first one were captured within the budget, so the others
+    // are captured, too.
+    let is_first_to_arrive = flow.received_bytes.get() == current.packet.len;
+    let (base, available_len) = (current.packet.payload_offset + 8, current.packet.len - 8);
+    let result = if is_first_to_arrive {
+        verdict::walk_frame(skb, base, available_len, slot)
     } else {
         progress::CAPTURE
     };
     if result >= progress::CAPTURE {
         // This includes a split header: user space reads the datagram from its start.
         flow.state.set(state::CAPTURED);
-        verdict::captured(slot, scratch.get());
+        verdict::count_capture(slot, scratch.get());
         return 1;
     }
     flow.state.set(state::WALKING);
-    keep_walk(slot, scratch, flow);
+    save_walk(slot, scratch, flow);
     0
 }
 
 /// Handles any fragment but the first.
 #[inline(always)]
-fn trailing(skb: *mut __sk_buff, slot: u32, mut scratch: Working<Scratch>, flow: &Flow) -> u32 {
-    let going_on = scratch.get();
+fn process_later_fragment(
+    skb: *mut __sk_buff,
+    slot: u32,
+    mut scratch: ScratchRef<Scratch>,
+    flow: &Flow,
+) -> u32 {
+    let current = scratch.get();
     let state = flow.state.get();
-    if state == state::HEADLESS {
+    if state == state::NO_FIRST_FRAGMENT {
         // Trailing fragments of unknown datagrams must not fill the packet ring.
-        return u32::from(verdict::charge(going_on.packet.len));
+        return u32::from(verdict::charge_capture_budget(current.packet.len));
     }
     if state != state::WALKING {
         return 1;
     }
     // Offset in the UDP payload, which begins 8 bytes into the IP payload.
-    let start = going_on.packet.offset - 8;
-    let end = start + going_on.packet.len;
-    let next = flow.next.get();
+    let start = current.packet.fragment_offset - 8;
+    let end = start + current.packet.len;
+    let next = flow.walk_offset.get();
     if next >= end {
         return 0;
     }
-    flow.walk.load(&mut going_on.walk);
-    going_on.count = 0;
-    going_on.unknown = 0;
-    let base = going_on.packet.body.wrapping_sub(start);
+    flow.walk.load(&mut current.walk);
+    current.record_count = 0;
+    current.is_unknown_writer = 0;
+    let base = current.packet.payload_offset.wrapping_sub(start);
     // The walk continues in a fragment that has not arrived yet: this one is out of order.
     let result = if next < start {
         progress::SPLIT
     } else {
-        verdict::run(skb, base, end, slot)
+        verdict::walk_frame(skb, base, end, slot)
     };
-    keep_walk(slot, scratch, flow);
+    save_walk(slot, scratch, flow);
     if result < progress::CAPTURE {
         return 0;
     }
-    hand_over(slot, scratch.get(), flow);
-    verdict::captured(slot, scratch.get());
+    write_handover(slot, scratch.get(), flow);
+    verdict::count_capture(slot, scratch.get());
     1
 }
 
 /// Writes the records found so far, except the last one, and stores the walk's state.
 #[inline(always)]
-fn keep_walk(slot: u32, mut scratch: Working<Scratch>, flow: &Flow) {
-    let walked = scratch.get();
-    let found = walked.count;
-    flow.walk.store(&walked.walk);
-    let next = walked.walk.offset;
-    let is_over = next + 4 > walked.walk.datagram_len;
-    flow.next.set(if is_over { u32::MAX } else { next });
-    if found == 0 {
+fn save_walk(slot: u32, mut scratch: ScratchRef<Scratch>, flow: &Flow) {
+    let current = scratch.get();
+    let record_count = current.record_count;
+    flow.walk.store(&current.walk);
+    let next = current.walk.offset;
+    let is_walk_complete = next + 4 > current.walk.datagram_len;
+    flow.walk_offset
+        .set(if is_walk_complete { u32::MAX } else { next });
+    if record_count == 0 {
         return;
     }
-    send_pending(slot, walked, flow);
-    if found > 1 {
-        verdict::flush(found - 1, u32::from(flag::AHEAD), slot);
+    write_pending_record(slot, current, flow);
+    if record_count > 1 {
+        verdict::write_records(record_count - 1, u32::from(flag::AHEAD), slot);
         flow.ahead.set(1);
     }
-    if let Some(last) = scratch.get().records.get(found as usize - 1) {
-        flow.pending.store(last);
-        flow.has_pending.set(1);
+    if let Some(last) = scratch.get().records.get(record_count as usize - 1) {
+        flow.pending_record.store(last);
+        flow.has_pending_record.set(1);
     }
 }
 
 #[inline(always)]
-fn send_pending(slot: u32, scratch: &mut Scratch, flow: &Flow) {
-    if flow.has_pending.get() != 0 {
-        flow.has_pending.set(0);
+fn write_pending_record(slot: u32, scratch: &mut Scratch, flow: &Flow) {
+    if flow.has_pending_record.get() != 0 {
+        flow.has_pending_record.set(0);
         flow.ahead.set(1);
-        flow.pending.load(&mut scratch.pending);
-        scratch.pending.flags |= flag::AHEAD;
-        runs::give(slot, &scratch.pending, false);
+        flow.pending_record.load(&mut scratch.pending_record);
+        scratch.pending_record.flags |= flag::AHEAD;
+        runs::write_or_merge(slot, &scratch.pending_record, false);
     }
 }
 
 /// Writes a HANDOVER record with the walk's state for user space.
 #[inline(always)]
-fn hand_over(slot: u32, scratch: &mut Scratch, flow: &Flow) {
-    send_pending(slot, scratch, flow);
+fn write_handover(slot: u32, scratch: &mut Scratch, flow: &Flow) {
+    write_pending_record(slot, scratch, flow);
     flow.state.set(state::HANDED_OVER);
     flow.ahead.set(1);
-    let (walk, packet, record) = (&scratch.walk, &scratch.packet, &mut scratch.pending);
+    let (walk, packet, record) = (&scratch.walk, &scratch.packet, &mut scratch.pending_record);
     copy(&walk.record, record);
-    record.time = packet.now;
+    record.time = packet.time_ns;
     record.kind = kind::HANDOVER;
     record.submessage_flags = 0;
     record.flags |= flag::AHEAD;
@@ -245,22 +258,22 @@ fn hand_over(slot: u32, scratch: &mut Scratch, flow: &Flow) {
     record.sample_size = 0;
     record.status_info = 0;
     count(slot, Counter::HandedOver, 1);
-    verdict::write(slot, record);
-    flow.pending.store(record);
+    verdict::write_record(slot, record);
+    flow.pending_record.store(record);
 }
 
 /// Writes the last record after all fragments have arrived.
 #[inline(always)]
-fn finish(slot: u32, scratch: &mut Scratch, flow: &Flow) {
+fn complete_datagram(slot: u32, scratch: &mut Scratch, flow: &Flow) {
     let state = flow.state.get();
-    let (walked, handed_over) = (state == state::WALKING, state == state::HANDED_OVER);
-    flow.state.set(state::DONE);
-    if !walked && !handed_over {
+    let (was_walked, handed_over) = (state == state::WALKING, state == state::HANDED_OVER);
+    flow.state.set(state::COMPLETE);
+    if !was_walked && !handed_over {
         return;
     }
-    let (pending, ahead) = (flow.has_pending.get() != 0, flow.ahead.get() != 0);
+    let (pending, ahead) = (flow.has_pending_record.get() != 0, flow.ahead.get() != 0);
     let metered = pending || ahead;
-    if walked {
+    if was_walked {
         count(
             slot,
             if metered {
@@ -275,16 +288,16 @@ fn finish(slot: u32, scratch: &mut Scratch, flow: &Flow) {
         return;
     }
     count(slot, Counter::FragmentedComplete, 1);
-    let record = &mut scratch.pending;
-    flow.pending.load(record);
+    let record = &mut scratch.pending_record;
+    flow.pending_record.load(record);
     if !pending {
         // All records were written ahead. This record marks them as valid.
         record.kind = kind::COMPLETE;
         record.datagram = flow.token.get();
         record.flags &= !flag::AHEAD;
     }
-    flow.has_pending.set(0);
-    record.time = scratch.packet.now;
+    flow.has_pending_record.set(0);
+    record.time = scratch.packet.time_ns;
     // After records written ahead, this record completes the datagram.
-    runs::give(slot, record, !ahead);
+    runs::write_or_merge(slot, record, !ahead);
 }

@@ -22,38 +22,41 @@ use ros2probe_wire::{
 };
 
 use crate::{
-    instructions::opaque,
-    maps::{SLOTS, Scratch, Working, claim_outgoing, count, piece, release, scratch},
+    instructions::hide_bounds,
+    maps::{
+        SCRATCH_SLOTS, Scratch, ScratchRef, claim_egress_slot, count, piece_buffer, release_slot,
+        scratch,
+    },
     pieces,
     registers::{is_aarch64, register},
-    settings::is_within,
+    settings::is_in_target_cgroup,
     verdict::{self, progress},
 };
 
 /// Maximum number of submessages read per message; a message with more is captured.
-const SUBMESSAGES: u32 = 64;
+const MAX_SUBMESSAGES: u32 = 64;
 /// Size of a buffer's description in a list, in bytes: an address and a length.
-const BUFFER: u64 = 16;
+const BUFFER_DESCRIPTOR_LEN: u64 = 16;
 /// Maximum number of buffers that one search visits, and of buffers in a list.
-const SEARCH: u32 = 64;
+const MAX_BUFFERS_PER_SEARCH: u32 = 64;
 const MAX_BUFFERS: u64 = 4096;
 /// Maximum number of pieces of one captured message.
 const MAX_PIECES: u32 = 256;
 /// Maximum length of a captured message, in bytes. Longer messages are metered, because user space
 /// reads messages as datagrams of at most 64 KiB.
-const MAX_CAPTURED: u32 = 0xffff;
+const MAX_CAPTURED_LEN: u32 = 0xffff;
 /// Maximum length of a message or buffer, in bytes: larger than any real one.
 const MAX_LEN: u32 = 1 << 28;
-/// Maximum number of words in one read of the walk, and length of [`Handed::bridge`].
-const BRIDGE: usize = 8;
+/// Maximum number of words in one read of the walk, and length of [`ShmMessage::bridge`].
+const MAX_READ_WORDS: usize = 8;
 
 /// The current message, by slot.
 #[map]
-static HANDED: PerCpuArray<Handed> = PerCpuArray::with_max_entries(SLOTS, 0);
+static HANDED: PerCpuArray<ShmMessage> = PerCpuArray::with_max_entries(SCRATCH_SLOTS, 0);
 
 /// One message in its sender's memory.
 #[repr(C)]
-struct Handed {
+struct ShmMessage {
     /// Address of the list of buffers; 0 = the message lies in one piece.
     list: u64,
     /// Number of buffers in the list.
@@ -66,25 +69,25 @@ struct Handed {
     start: u32,
     end: u32,
     /// Words that span two buffers.
-    bridge: [u32; BRIDGE],
+    bridge: [u32; MAX_READ_WORDS],
 }
 
 /// The message as the walk reads it.
-struct Message {
+struct MessageBytes {
     slot: u32,
 }
 
-impl Bytes for Message {
+impl Bytes for MessageBytes {
     #[inline(always)]
     fn words<const N: usize>(&self, offset: u32) -> Option<[u32; N]> {
         let len = 4 * N as u32;
         let mut handed = handed(self.slot)?;
         if offset < handed.start || offset + len > handed.end {
-            let found = shm_find(self.slot, offset, len);
+            let found = seek_buffer(self.slot, offset, len);
             handed = self::handed(self.slot)?;
             match found {
-                found::HERE => {}
-                found::BRIDGED => {
+                buffer_search::IN_BUFFER => {}
+                buffer_search::SPANS_BUFFERS => {
                     let mut words = [core::hint::black_box(0); N];
                     let mut index = 0;
                     while index < N {
@@ -100,19 +103,19 @@ impl Bytes for Message {
     }
 }
 
-/// Results of [`shm_find`]. The values are `u32` because they cross a function boundary.
-mod found {
-    pub const NOWHERE: u32 = 0;
+/// Results of [`seek_buffer`]. The values are `u32` because they cross a function boundary.
+mod buffer_search {
+    pub const NOT_FOUND: u32 = 0;
     /// The bytes are in the current buffer.
-    pub const HERE: u32 = 1;
+    pub const IN_BUFFER: u32 = 1;
     /// The bytes are in the bridge.
-    pub const BRIDGED: u32 = 2;
+    pub const SPANS_BUFFERS: u32 = 2;
 }
 
-/// Handles a call that writes a message, from its saved registers. With `in_list`, the call passes
-/// the message as a list of buffers.
+/// Handles a call that writes a message, from its saved registers. With `is_buffer_list`, the call
+/// passes the message as a list of buffers.
 #[inline(always)]
-pub fn look(registers: *const u64, in_list: bool) {
+pub fn process_send(registers: *const u64, is_buffer_list: bool) {
     // The caller allocates the object that the call returns. On x86-64 its address is the first
     // argument, before `this`; on AArch64 it has its own register, so the arguments are x1 and x2.
     let (message, len) = if is_aarch64() {
@@ -121,26 +124,28 @@ pub fn look(registers: *const u64, in_list: bool) {
         // rdx and rcx.
         (register!(registers, 96), register!(registers, 88))
     };
-    if !is_within() {
+    if !is_in_target_cgroup() {
         return;
     }
-    let Some(slot) = claim_outgoing() else { return };
-    shm_message(slot, message, len as u32, u32::from(in_list));
-    release(slot);
+    let Some(slot) = claim_egress_slot() else {
+        return;
+    };
+    shm_message(slot, message, len as u32, u32::from(is_buffer_list));
+    release_slot(slot);
 }
 
 /// Handles one message of `len` bytes at `address`.
 #[unsafe(no_mangle)]
 #[inline(never)]
-pub extern "C" fn shm_message(slot: u32, address: u64, len: u32, in_list: u32) -> u32 {
+pub extern "C" fn shm_message(slot: u32, address: u64, len: u32, is_buffer_list: u32) -> u32 {
     let (Some(mut working), Some(mut handed)) = (scratch(slot), handed(slot)) else {
         return 0;
     };
-    if let Err(reason) = locate(&mut handed, address, len, in_list) {
+    if let Err(reason) = locate_buffers(&mut handed, address, len, is_buffer_list) {
         count(slot, reason, 1);
         return 0;
     }
-    let message = Message { slot };
+    let message = MessageBytes { slot };
     let Some([magic, _version, source @ ..]) = message.words::<5>(0) else {
         count(slot, Counter::Unreadable, 1);
         return 0;
@@ -153,12 +158,12 @@ pub extern "C" fn shm_message(slot: u32, address: u64, len: u32, in_list: u32) -
     // SAFETY: no preconditions.
     let now = unsafe { bpf_ktime_get_ns() };
     let scratch = working.get();
-    let token = clear(scratch, slot, now);
+    let token = reset_scratch(scratch, slot, now);
     begin_walk(scratch, source, len);
-    verdict::heard(scratch, source, now);
+    verdict::note_participant_seen(scratch, source, now);
     if shm_walk(slot, len) == progress::CAPTURE {
-        if len <= MAX_CAPTURED {
-            verdict::captured(slot, working.get());
+        if len <= MAX_CAPTURED_LEN {
+            verdict::count_capture(slot, working.get());
             if shm_capture(slot, len, token) != 0 {
                 return 1;
             }
@@ -168,13 +173,13 @@ pub extern "C" fn shm_message(slot: u32, address: u64, len: u32, in_list: u32) -
         // The walk is repeated as if a copy had been captured: submessages of interest become
         // records.
         let scratch = working.get();
-        scratch.count = core::hint::black_box(0);
-        scratch.unknown = core::hint::black_box(0);
-        scratch.repeated = core::hint::black_box(1);
+        scratch.record_count = core::hint::black_box(0);
+        scratch.is_unknown_writer = core::hint::black_box(0);
+        scratch.is_duplicate = core::hint::black_box(1);
         begin_walk(scratch, source, len);
         shm_walk(slot, len);
     }
-    let records = working.get().count;
+    let records = working.get().record_count;
     count(
         slot,
         if records == 0 {
@@ -184,28 +189,33 @@ pub extern "C" fn shm_message(slot: u32, address: u64, len: u32, in_list: u32) -
         },
         1,
     );
-    verdict::flush(records, u32::from(flag::SHM | flag::EXACT), slot);
+    verdict::write_records(records, u32::from(flag::SHM | flag::EXACT), slot);
     1
 }
 
 /// Stores the location of the message's bytes. Returns the counter to increment if the message
 /// cannot be read.
 #[inline(always)]
-fn locate(handed: &mut Handed, address: u64, len: u32, in_list: u32) -> Result<(), Counter> {
+fn locate_buffers(
+    handed: &mut ShmMessage,
+    address: u64,
+    len: u32,
+    is_buffer_list: u32,
+) -> Result<(), Counter> {
     let zero = core::hint::black_box(0);
     if len < walk::HEADER_LEN || len > MAX_LEN {
         return Err(Counter::Malformed);
     }
     handed.next = zero;
     handed.start = zero;
-    if in_list == 0 {
+    if is_buffer_list == 0 {
         (handed.list, handed.buffers) = (u64::from(zero), zero);
         (handed.address, handed.end) = (address, len);
         return Ok(());
     }
     // A std::vector: the addresses at which its contents begin and end.
     let [begin, end] = read::<[u64; 2]>(address).ok_or(Counter::Unreadable)?;
-    let buffers = end.wrapping_sub(begin) / BUFFER;
+    let buffers = end.wrapping_sub(begin) / BUFFER_DESCRIPTOR_LEN;
     if buffers == 0 || buffers > MAX_BUFFERS {
         return Err(Counter::Malformed);
     }
@@ -216,14 +226,14 @@ fn locate(handed: &mut Handed, address: u64, len: u32, in_list: u32) -> Result<(
 
 /// Clears the working memory for a message without network addresses; returns the message's token.
 #[inline(always)]
-fn clear(scratch: &mut Scratch, slot: u32, now: u64) -> u32 {
+fn reset_scratch(scratch: &mut Scratch, slot: u32, now: u64) -> u32 {
     let zero = core::hint::black_box(0);
-    scratch.packet.now = now;
-    scratch.packet.host = zero;
-    scratch.count = zero;
-    scratch.unknown = zero;
-    scratch.repeated = zero;
-    scratch.named = scratch.named.wrapping_add(1);
+    scratch.packet.time_ns = now;
+    scratch.packet.is_at_socket = zero;
+    scratch.record_count = zero;
+    scratch.is_unknown_writer = zero;
+    scratch.is_duplicate = zero;
+    scratch.token_count = scratch.token_count.wrapping_add(1);
     let record = &mut scratch.walk.record;
     record.time = now;
     record.destination = [zero; 4];
@@ -237,16 +247,16 @@ fn clear(scratch: &mut Scratch, slot: u32, now: u64) -> u32 {
     record.flags = zero as u16;
     // SAFETY: no preconditions.
     let cpu = unsafe { bpf_get_smp_processor_id() } as u32;
-    // The token has the form of those of `host::identify`.
-    scratch.named << 12 | (slot + 1) << 8 | (cpu & 0xff)
+    // The token has the form of those of `host::assign_token`.
+    scratch.token_count << 12 | (slot + 1) << 8 | (cpu & 0xff)
 }
 
 /// Starts a walk over the message.
 #[inline(always)]
 fn begin_walk(scratch: &mut Scratch, source: [u32; 3], len: u32) {
     scratch.walk.begin(source, len);
-    if len > MAX_CAPTURED {
-        scratch.walk.record.datagram_len = MAX_CAPTURED as u16;
+    if len > MAX_CAPTURED_LEN {
+        scratch.walk.record.datagram_len = MAX_CAPTURED_LEN as u16;
     }
 }
 
@@ -255,9 +265,9 @@ fn begin_walk(scratch: &mut Scratch, source: [u32; 3], len: u32) {
 #[inline(never)]
 pub extern "C" fn shm_walk(slot: u32, len: u32) -> u32 {
     let mut submessages = 0;
-    while submessages < SUBMESSAGES {
-        let result = shm_advance(slot, len);
-        if result != progress::ON {
+    while submessages < MAX_SUBMESSAGES {
+        let result = walk_shm_submessage(slot, len);
+        if result != progress::CONTINUE {
             return result;
         }
         submessages += 1;
@@ -265,23 +275,23 @@ pub extern "C" fn shm_walk(slot: u32, len: u32) -> u32 {
     progress::CAPTURE
 }
 
-/// Walks one submessage, as `verdict::advance` does.
+/// Walks one submessage. Unlike in `verdict::walk_submessage`, a split submessage ends the walk.
 #[unsafe(no_mangle)]
 #[inline(never)]
-pub extern "C" fn shm_advance(slot: u32, len: u32) -> u32 {
+pub extern "C" fn walk_shm_submessage(slot: u32, len: u32) -> u32 {
     let Some(mut scratch) = scratch(slot) else {
-        return progress::STOP;
+        return progress::FRAME_DONE;
     };
     let scratch = scratch.get();
-    match walk::step(&mut scratch.walk, &Message { slot }, len) {
-        Step::End | Step::Later | Step::Split => progress::STOP,
-        Step::Passed => progress::ON,
+    match walk::step(&mut scratch.walk, &MessageBytes { slot }, len) {
+        Step::End | Step::Later | Step::Split => progress::FRAME_DONE,
+        Step::Passed => progress::CONTINUE,
         Step::Malformed => {
             count(slot, Counter::Malformed, 1);
-            progress::STOP
+            progress::FRAME_DONE
         }
-        Step::Endpoint => verdict::endpoint(slot, scratch, false),
-        Step::LongGap => verdict::endpoint(slot, scratch, true),
+        Step::Endpoint => verdict::apply_verdict(slot, scratch, false),
+        Step::LongGap => verdict::apply_verdict(slot, scratch, true),
     }
 }
 
@@ -289,12 +299,12 @@ pub extern "C" fn shm_advance(slot: u32, len: u32) -> u32 {
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn shm_capture(slot: u32, len: u32, token: u32) -> u32 {
-    let (Some(mut scratch), Some(mut buffer)) = (scratch(slot), piece(slot)) else {
+    let (Some(mut scratch), Some(mut buffer)) = (scratch(slot), piece_buffer(slot)) else {
         return 0;
     };
     let zero = core::hint::black_box(0);
     let piece = &mut buffer.piece;
-    piece.time = scratch.get().packet.now;
+    piece.time = scratch.get().packet.time_ns;
     piece.socket = u64::from(zero);
     piece.source = [zero; 4];
     piece.destination = [zero; 4];
@@ -310,11 +320,11 @@ pub extern "C" fn shm_capture(slot: u32, len: u32, token: u32) -> u32 {
             count(slot, Counter::CapturedBytes, u64::from(len));
             return 1;
         }
-        let taken = shm_piece(slot, offset);
-        if taken == 0 {
+        let piece_len = write_shm_piece(slot, offset);
+        if piece_len == 0 {
             break;
         }
-        offset += taken;
+        offset += piece_len;
         number += 1;
     }
     count(slot, Counter::PiecesLost, 1);
@@ -325,16 +335,20 @@ pub extern "C" fn shm_capture(slot: u32, len: u32, token: u32) -> u32 {
 /// length of the piece, or 0 if the piece could not be read or did not fit.
 #[unsafe(no_mangle)]
 #[inline(never)]
-pub extern "C" fn shm_piece(slot: u32, offset: u32) -> u32 {
-    if shm_find(slot, offset, 1) != found::HERE {
+pub extern "C" fn write_shm_piece(slot: u32, offset: u32) -> u32 {
+    if seek_buffer(slot, offset, 1) != buffer_search::IN_BUFFER {
         return 0;
     }
-    let (Some(handed), Some(mut buffer)) = (handed(slot), piece(slot)) else {
+    let (Some(handed), Some(mut buffer)) = (handed(slot), piece_buffer(slot)) else {
         return 0;
     };
-    let within = handed.end.wrapping_sub(offset);
-    let left = buffer.piece.datagram_len.wrapping_sub(offset);
-    let len = if within < left { within } else { left };
+    let left_in_buffer = handed.end.wrapping_sub(offset);
+    let remaining = buffer.piece.datagram_len.wrapping_sub(offset);
+    let len = if left_in_buffer < remaining {
+        left_in_buffer
+    } else {
+        remaining
+    };
     let len = if len > PIECE_BYTES { PIECE_BYTES } else { len };
     if len == 0 {
         return 0;
@@ -343,14 +357,14 @@ pub extern "C" fn shm_piece(slot: u32, offset: u32) -> u32 {
     buffer.piece.len = len;
     let from = handed.address + u64::from(offset.wrapping_sub(handed.start));
     // SAFETY: the buffer can hold the longest piece; the kernel checks the address.
-    let loaded = unsafe {
+    let status = unsafe {
         bpf_probe_read_user(
             buffer.bytes.as_mut_ptr().cast(),
-            pieces::bounded(len) as u32,
+            pieces::bounded_piece_len(len) as u32,
             from as *const _,
         )
     };
-    if loaded != 0 || pieces::publish(slot, &mut buffer) == 0 {
+    if status != 0 || pieces::push_piece(slot, &mut buffer) == 0 {
         return 0;
     }
     len
@@ -360,40 +374,40 @@ pub extern "C" fn shm_piece(slot: u32, offset: u32) -> u32 {
 /// Copies bytes that span several buffers to the bridge.
 #[unsafe(no_mangle)]
 #[inline(never)]
-pub extern "C" fn shm_find(slot: u32, offset: u32, len: u32) -> u32 {
+pub extern "C" fn seek_buffer(slot: u32, offset: u32, len: u32) -> u32 {
     let Some(mut message) = handed(slot) else {
-        return found::NOWHERE;
+        return buffer_search::NOT_FOUND;
     };
     if offset < message.start {
         // The search restarts from the first buffer. A capture causes only one restart.
         let zero = core::hint::black_box(0);
         (message.next, message.start, message.end) = (zero, zero, zero);
     }
-    if shm_move(slot, offset) == 0 {
-        return found::NOWHERE;
+    if advance_to_buffer(slot, offset) == 0 {
+        return buffer_search::NOT_FOUND;
     }
-    // The message is looked up again, because `shm_move` has held a reference of its own.
+    // The message is looked up again, because `advance_to_buffer` has held a reference of its own.
     if handed(slot).is_some_and(|message| offset + len <= message.end) {
-        return found::HERE;
+        return buffer_search::IN_BUFFER;
     }
     let mut index = 0;
-    while index < 4 * BRIDGE as u32 {
+    while index < 4 * MAX_READ_WORDS as u32 {
         if index >= len {
             break;
         }
-        if shm_bridge(slot, offset + index, index) == 0 {
-            return found::NOWHERE;
+        if copy_spanning_byte(slot, offset + index, index) == 0 {
+            return buffer_search::NOT_FOUND;
         }
         index += 1;
     }
-    found::BRIDGED
+    buffer_search::SPANS_BUFFERS
 }
 
 /// Copies one byte of the message to the bridge.
 #[unsafe(no_mangle)]
 #[inline(never)]
-pub extern "C" fn shm_bridge(slot: u32, offset: u32, index: u32) -> u32 {
-    if shm_move(slot, offset) == 0 {
+pub extern "C" fn copy_spanning_byte(slot: u32, offset: u32, index: u32) -> u32 {
+    if advance_to_buffer(slot, offset) == 0 {
         return 0;
     }
     let Some(mut handed) = handed(slot) else {
@@ -403,7 +417,7 @@ pub extern "C" fn shm_bridge(slot: u32, offset: u32, index: u32) -> u32 {
     let Some([byte]) = read::<[u8; 1]>(from) else {
         return 0;
     };
-    let index = opaque(index) as usize & (4 * BRIDGE - 1);
+    let index = hide_bounds(index) as usize & (4 * MAX_READ_WORDS - 1);
     // SAFETY: an index below the array's length.
     unsafe {
         *(&raw mut handed.bridge).cast::<u8>().add(index) = byte;
@@ -414,19 +428,19 @@ pub extern "C" fn shm_bridge(slot: u32, offset: u32, index: u32) -> u32 {
 /// Moves along the list to the buffer with the byte at `offset`; returns 0 if no buffer holds it.
 #[unsafe(no_mangle)]
 #[inline(never)]
-pub extern "C" fn shm_move(slot: u32, offset: u32) -> u32 {
+pub extern "C" fn advance_to_buffer(slot: u32, offset: u32) -> u32 {
     let Some(mut handed) = handed(slot) else {
         return 0;
     };
     let mut steps = 0;
-    while steps < SEARCH {
+    while steps < MAX_BUFFERS_PER_SEARCH {
         if offset < handed.end {
             return u32::from(offset >= handed.start);
         }
         if handed.next >= handed.buffers {
             return 0;
         }
-        let at = handed.list + u64::from(handed.next) * BUFFER;
+        let at = handed.list + u64::from(handed.next) * BUFFER_DESCRIPTOR_LEN;
         let Some([address, len]) = read::<[u64; 2]>(at) else {
             return 0;
         };
@@ -445,8 +459,8 @@ pub extern "C" fn shm_move(slot: u32, offset: u32) -> u32 {
 }
 
 #[inline(always)]
-fn handed(slot: u32) -> Option<Working<Handed>> {
-    Working::of(&HANDED, slot)
+fn handed(slot: u32) -> Option<ScratchRef<ShmMessage>> {
+    ScratchRef::lookup(&HANDED, slot)
 }
 
 /// Reads a plain value from the memory of the running process.

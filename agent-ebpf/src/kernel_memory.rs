@@ -14,22 +14,22 @@ pub static LAYOUT: [u32; Layout::COUNT] = [Layout::ABSENT; Layout::COUNT];
 /// Returns the offset of a member, or an enumerator, in the running kernel; [`Layout::ABSENT`] if
 /// it does not exist.
 #[inline(always)]
-pub fn place(of: Layout) -> u32 {
+pub fn layout_entry(entry: Layout) -> u32 {
     // SAFETY: an index below the array's length.
-    let place = unsafe { (&raw const LAYOUT).cast::<u32>().add(of as usize) };
+    let address = unsafe { (&raw const LAYOUT).cast::<u32>().add(entry as usize) };
     // SAFETY: a constant of the loaded object, never written while the program runs.
-    unsafe { core::ptr::read_volatile(place) }
+    unsafe { core::ptr::read_volatile(address) }
 }
 
-/// Reads the member `of` of the structure at `address`.
+/// Reads the member `entry` of the structure at `address`.
 #[inline(always)]
-pub fn member<T: Copy>(address: u64, of: Layout) -> Option<T> {
-    read(address.wrapping_add(u64::from(place(of))))
+pub fn read_member<T: Copy>(address: u64, entry: Layout) -> Option<T> {
+    read_kernel(address.wrapping_add(u64::from(layout_entry(entry))))
 }
 
 /// Reads a plain value from kernel memory.
 #[inline(always)]
-pub fn read<T: Copy>(address: u64) -> Option<T> {
+pub fn read_kernel<T: Copy>(address: u64) -> Option<T> {
     let mut value = MaybeUninit::<T>::uninit();
     // SAFETY: the destination has the size given; the kernel checks the address.
     let result = unsafe {

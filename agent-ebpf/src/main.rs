@@ -44,9 +44,12 @@ use aya_ebpf::{
 use ros2probe_wire::filter::Counter;
 
 use crate::{
-    maps::{INTERFACES, NEW_INTERFACES, WIRE, claim_incoming, count, count_outside, release},
+    maps::{
+        INTERFACES, NEW_INTERFACES, WIRE, claim_ingress_slot, count, count_without_slot,
+        release_slot,
+    },
     packet::hook,
-    settings::setting,
+    settings::read_global,
 };
 
 /// `skb->pkt_type` of a frame that this host sends.
@@ -75,29 +78,29 @@ pub fn wire(context: SkBuffContext) -> i64 {
 /// Returns 1, so that the kernel delivers the datagram.
 #[cgroup_skb(ingress)]
 pub fn host_ingress(context: SkBuffContext) -> i32 {
-    host::look(context.skb.skb, hook::INGRESS);
+    host::process_packet(context.skb.skb, hook::INGRESS);
     1
 }
 
 /// Runs as [`host_ingress`] does, for a datagram that a socket sends, before fragmentation.
 #[cgroup_skb(egress)]
 pub fn host_egress(context: SkBuffContext) -> i32 {
-    host::look(context.skb.skb, hook::EGRESS);
+    host::process_packet(context.skb.skb, hook::EGRESS);
     1
 }
 
-/// Runs in addition to [`host_ingress`], for TCP segments of Zenoh. Linux may merge several
-/// segments of a connection into one packet.
+/// Runs in addition to [`host_ingress`], for TCP segments, which may carry Zenoh or RTPS. Linux may
+/// merge several segments of a connection into one packet.
 #[cgroup_skb(ingress)]
 pub fn zenoh_ingress(context: SkBuffContext) -> i32 {
-    zenoh::socket(context.skb.skb, hook::INGRESS);
+    zenoh::process_socket_segment(context.skb.skb, hook::INGRESS);
     1
 }
 
 /// Runs as [`zenoh_ingress`] does, for segments that a socket sends.
 #[cgroup_skb(egress)]
 pub fn zenoh_egress(context: SkBuffContext) -> i32 {
-    zenoh::socket(context.skb.skb, hook::EGRESS);
+    zenoh::process_socket_segment(context.skb.skb, hook::EGRESS);
     1
 }
 
@@ -105,21 +108,21 @@ pub fn zenoh_egress(context: SkBuffContext) -> i32 {
 /// Returns 1, which changes nothing.
 #[cgroup_sock_addr(recvmsg4)]
 pub fn received_ipv4(context: SockAddrContext) -> i32 {
-    delivery::received(context.sock_addr);
+    delivery::on_recvmsg(context.sock_addr);
     1
 }
 
 /// Runs as [`received_ipv4`] does, for IPv6.
 #[cgroup_sock_addr(recvmsg6)]
 pub fn received_ipv6(context: SockAddrContext) -> i32 {
-    delivery::received(context.sock_addr);
+    delivery::on_recvmsg(context.sock_addr);
     1
 }
 
 /// Runs for every datagram that does not fit a socket's buffer, directly after [`host_ingress`].
 #[raw_tracepoint]
 pub fn socket_full(context: RawTracePointContext) -> u32 {
-    socket_full::refused(&context);
+    socket_full::on_udp_fail_queue_rcv_skb(&context);
     0
 }
 
@@ -127,14 +130,14 @@ pub fn socket_full(context: RawTracePointContext) -> u32 {
 /// [`socket_full`] does not cover IPv6.
 #[raw_tracepoint]
 pub fn no_room_freed(context: RawTracePointContext) -> u32 {
-    socket_full::freed(&context);
+    socket_full::on_kfree_skb(&context);
     0
 }
 
 /// Runs as [`no_room_freed`] does, on kernels that report no drop reason.
 #[raw_tracepoint]
 pub fn no_room_unexplained(context: RawTracePointContext) -> u32 {
-    socket_full::unexplained(&context);
+    socket_full::on_kfree_skb_no_reason(&context);
     0
 }
 
@@ -142,28 +145,28 @@ pub fn no_room_unexplained(context: RawTracePointContext) -> u32 {
 /// reason.
 #[raw_tracepoint]
 pub fn not_reassembled(context: RawTracePointContext) -> u32 {
-    reassembly::dropped(&context);
+    reassembly::on_kfree_skb(&context);
     0
 }
 
 /// Runs as [`not_reassembled`] does, on kernels that report no drop reason.
 #[raw_tracepoint]
 pub fn not_reassembled_unexplained(context: RawTracePointContext) -> u32 {
-    reassembly::unexplained(&context);
+    reassembly::on_kfree_skb_no_reason(&context);
     0
 }
 
 /// Runs where a process is about to copy a message in one piece into shared memory (Fast DDS 2.x).
 #[uprobe]
 pub fn shm_handed(context: ProbeContext) -> u32 {
-    handed::look(context.as_ptr() as *const u64, false);
+    handed::process_send(context.as_ptr() as *const u64, false);
     0
 }
 
 /// Runs as [`shm_handed`] does, for a message in a list of buffers (Fast DDS 3.x).
 #[uprobe]
 pub fn shm_handed_list(context: ProbeContext) -> u32 {
-    handed::look(context.as_ptr() as *const u64, true);
+    handed::process_send(context.as_ptr() as *const u64, true);
     0
 }
 
@@ -174,28 +177,28 @@ fn frame(skb: *mut __sk_buff) -> Option<i64> {
         unsafe { ((*skb).pkt_type, (*skb).ifindex, (*skb).gso_segs) };
     if interface == LOOPBACK && pkt_type == PACKET_OUTGOING {
         // Loopback frames pass twice; only the received copy is read.
-        count_outside(Counter::LoopbackCopies, 1);
+        count_without_slot(Counter::LoopbackCopies, 1);
         return Some(0);
     }
     let accepted = match INTERFACES.get_ptr(interface) {
         // SAFETY: a map value pointer that was checked against null.
         Some(accepted) => unsafe { *accepted },
-        None => setting(&NEW_INTERFACES),
+        None => read_global(&NEW_INTERFACES),
     };
     if accepted == 0 {
-        count_outside(Counter::InterfaceExcluded, 1);
+        count_without_slot(Counter::InterfaceExcluded, 1);
         return Some(0);
     }
-    let slot = claim_incoming()?;
+    let slot = claim_ingress_slot()?;
     let kept = claimed(skb, segments, slot);
-    release(slot);
+    release_slot(slot);
     kept
 }
 
 #[inline(always)]
 fn claimed(skb: *mut __sk_buff, segments: u32, slot: u32) -> Option<i64> {
-    if packet::parse(skb, slot, hook::WIRE) == 0 {
-        if zenoh::frame(skb, slot, packet::start(skb)) == 0 {
+    if packet::parse_ip_packet(skb, slot, hook::INTERFACE) == 0 {
+        if zenoh::filter_tcp_frame(skb, slot, packet::ip_header_offset(skb)) == 0 {
             return Some(0);
         }
         // SAFETY: the verifier rewrites reads of this field.
@@ -209,9 +212,9 @@ fn claimed(skb: *mut __sk_buff, segments: u32, slot: u32) -> Option<i64> {
         return Some(0);
     }
     let keep = if packet::is_fragment(slot)? {
-        fragment::pass(skb, slot)
+        fragment::process_fragment(skb, slot)
     } else {
-        verdict::whole(skb, slot)
+        verdict::decide_datagram(skb, slot)
     };
     if keep == 0 {
         return Some(0);

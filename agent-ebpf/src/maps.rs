@@ -18,8 +18,8 @@ use ros2probe_wire::{
 };
 
 use crate::{
-    instructions::{add, opaque},
-    settings::setting,
+    instructions::{atomic_add, hide_bounds},
+    settings::read_global,
 };
 
 /// `BPF_F_NO_PREALLOC`, for a map that only user space fills and that is mostly empty. No map of a
@@ -27,18 +27,18 @@ use crate::{
 /// the kernel refuses the program.
 const NO_PREALLOC: u32 = 1;
 
-/// Maximum number of records that the filter writes for one datagram; a datagram with more is
-/// captured.
+/// Maximum number of records that the filter writes for one frame, or for one datagram at a
+/// socket. A datagram with more is captured, if the ring has room for it.
 pub const RECORDS_PER_DATAGRAM: u32 = 32;
 const _: () = assert!(RECORDS_PER_DATAGRAM.is_power_of_two());
 
 /// Number of slots: the maximum number of runs of programs that are active on one CPU, see
-/// [`claim_outgoing`]. Received datagrams and frames use the slots below [`OUTGOING_SLOT`], sent
-/// datagrams the others.
-pub const SLOTS: u32 = 6;
-const _: () = assert!((SLOTS as usize) < COUNTER_SLOTS && COUNTER_SLOTS.is_power_of_two());
+/// [`claim_egress_slot`]. Received datagrams and frames use the slots below [`FIRST_EGRESS_SLOT`],
+/// sent datagrams the others.
+pub const SCRATCH_SLOTS: u32 = 6;
+const _: () = assert!((SCRATCH_SLOTS as usize) < COUNTER_SLOTS && COUNTER_SLOTS.is_power_of_two());
 /// First slot for sent datagrams.
-pub const OUTGOING_SLOT: u32 = 2;
+pub const FIRST_EGRESS_SLOT: u32 = 2;
 /// Number of captures remembered per CPU, a power of two.
 const RECENT_CAPACITY: u32 = 16;
 
@@ -104,27 +104,29 @@ pub static RECORDS: RingBuf = RingBuf::with_byte_size(256 * 1024, 0);
 #[map]
 pub static COUNTERS: PerCpuArray<[[u64; Counter::ALL.len()]; COUNTER_SLOTS]> =
     PerCpuArray::with_max_entries(1, 0);
-/// Captured datagrams of the host hook, in [`PieceBuffer`]s cut to their length.
+/// Captured datagrams and messages in pieces, and chunks of TCP connections: [`PieceBuffer`]s cut
+/// to their length.
 #[map]
 pub static PIECES: RingBuf = RingBuf::with_byte_size(1024 * 1024, 0);
-/// Sockets that the host hook has seen, by cookie.
+/// Sockets with captured or metered datagrams, and sockets of recognized TCP connections, by
+/// cookie.
 #[map]
 pub static SOCKETS: LruHashMap<u64, Socket> = LruHashMap::with_max_entries(SOCKET_CAPACITY, 0);
 /// Keys that are too large for the stack, by slot.
 #[map]
-static RUN_KEYS: PerCpuArray<RunKeys> = PerCpuArray::with_max_entries(SLOTS, 0);
+static RUN_KEYS: PerCpuArray<RunKeys> = PerCpuArray::with_max_entries(SCRATCH_SLOTS, 0);
 /// Buffers for building pieces, by slot.
 #[map]
-static PIECE: PerCpuArray<PieceBuffer> = PerCpuArray::with_max_entries(SLOTS, 0);
+static PIECE: PerCpuArray<PieceBuffer> = PerCpuArray::with_max_entries(SCRATCH_SLOTS, 0);
 /// The current frame or datagram, by slot.
 #[map]
-static SCRATCH: PerCpuArray<Scratch> = PerCpuArray::with_max_entries(SLOTS, 0);
+static SCRATCH: PerCpuArray<Scratch> = PerCpuArray::with_max_entries(SCRATCH_SLOTS, 0);
 /// Recent captures of this CPU, by hash.
 #[map]
-static RECENT: PerCpuArray<Recent> = PerCpuArray::with_max_entries(RECENT_CAPACITY, 0);
+static RECENT: PerCpuArray<RecentCapture> = PerCpuArray::with_max_entries(RECENT_CAPACITY, 0);
 /// The last datagram that a socket of this host received on this CPU.
 #[map]
-static LAST: PerCpuArray<Last> = PerCpuArray::with_max_entries(1, 0);
+static LAST: PerCpuArray<LastReceived> = PerCpuArray::with_max_entries(1, 0);
 
 /// A value that other runs read and write concurrently, on this CPU or others. No reference to the
 /// value exists; it is only copied in and out.
@@ -206,8 +208,8 @@ pub struct RunKey {
 /// Buffers for building [`RunKey`]s, and the current run.
 #[repr(C)]
 pub struct RunKeys {
-    pub here: RunKey,
-    pub elsewhere: RunKey,
+    pub this_cpu: RunKey,
+    pub other_cpu: RunKey,
     pub run: Record,
 }
 
@@ -216,22 +218,22 @@ pub struct RunKeys {
 pub struct Flow {
     pub walk: Shared<Walk>,
     /// The last record found, written when the datagram is complete.
-    pub pending: Shared<Record>,
-    pub born: Shared<u64>,
+    pub pending_record: Shared<Record>,
+    pub created_ns: Shared<u64>,
     /// IP payload bytes seen.
-    pub seen: Shared<u32>,
+    pub received_bytes: Shared<u32>,
     /// Total IP payload bytes, 0 until the last fragment arrives.
-    pub expected: Shared<u32>,
+    pub total_bytes: Shared<u32>,
     /// Start offsets of the fragments seen, one bit per 8 bytes (RFC 791): a link with a small MTU
     /// may cut fragments to this length.
-    pub starts: [Shared<u64>; 128],
+    pub seen_offsets: [Shared<u64>; 128],
     pub state: Shared<u32>,
-    pub has_pending: Shared<u32>,
+    pub has_pending_record: Shared<u32>,
     /// Whether records were written ahead, for which user space waits for the completion record.
     pub ahead: Shared<u32>,
     pub token: Shared<u32>,
     /// Offset in the UDP payload at which the walk continues; `u32::MAX` = the walk is over.
-    pub next: Shared<u32>,
+    pub walk_offset: Shared<u32>,
     pub unused: u32,
 }
 
@@ -242,21 +244,21 @@ pub struct Packet {
     pub source: [u32; 4],
     pub destination: [u32; 4],
     /// Offset of the IP payload in the socket buffer.
-    pub body: u32,
+    pub payload_offset: u32,
     /// IP payload bytes in this frame.
     pub len: u32,
     /// Offset of these bytes in the whole IP payload.
-    pub offset: u32,
+    pub fragment_offset: u32,
     /// 1 = more fragments follow.
-    pub more: u32,
+    pub more_fragments: u32,
     pub identification: u32,
-    pub fragmented: u32,
-    pub ipv6: u32,
-    pub outgoing: u32,
+    pub is_fragment: u32,
+    pub is_ipv6: u32,
+    pub is_outgoing: u32,
     pub interface: u32,
     /// 1 = seen at a socket, 0 = seen on an interface.
-    pub host: u32,
-    pub now: u64,
+    pub is_at_socket: u32,
+    pub time_ns: u64,
 }
 
 /// Working memory of one run of a program, which is too large for the 512 bytes of the BPF stack.
@@ -266,31 +268,31 @@ pub struct Scratch {
     pub packet: Packet,
     pub records: [Record; RECORDS_PER_DATAGRAM as usize],
     /// The record of a fragmented datagram that is written next.
-    pub pending: Record,
+    pub pending_record: Record,
     /// Number of filled elements of `records`.
-    pub count: u32,
-    /// Whether user space has classified the endpoint of the last one of `records`.
-    pub classified: u32,
+    pub record_count: u32,
+    /// Whether user space has classified the endpoint that was looked up last.
+    pub last_endpoint_is_classified: u32,
     /// Whether the capture is needed only for an unclassified writer.
-    pub unknown: u32,
+    pub is_unknown_writer: u32,
     /// Host hook: whether a copy of the datagram was captured just before.
-    pub repeated: u32,
+    pub is_duplicate: u32,
     /// The participant whose message was seen last, and the time of its last note in
     /// [`PARTICIPANTS`].
-    pub heard: [u32; 3],
-    pub heard_at: u64,
+    pub last_participant: [u32; 3],
+    pub last_participant_ns: u64,
     /// Host hook: the socket last looked up in [`SOCKETS`], and the time of the lookup.
-    pub met: u64,
-    pub met_at: u64,
+    pub last_socket: u64,
+    pub last_socket_lookup_ns: u64,
     /// Number of tokens issued for this slot.
-    pub named: u32,
+    pub token_count: u32,
     /// Number of runs that hold this slot, or have failed to claim it and not withdrawn yet.
-    claims: u64,
+    claim_count: u64,
 }
 
 /// Identifies a captured datagram by the submessage that required the capture.
 #[repr(C)]
-pub struct Recent {
+pub struct RecentCapture {
     pub time: Shared<u64>,
     pub sequence_number: Shared<u64>,
     pub writer: [Shared<u32>; 4],
@@ -302,21 +304,21 @@ pub struct Recent {
 /// the datagram is not delivered. The datagram's records are still in the slot, because only
 /// received datagrams use these slots, one after the other.
 #[repr(C)]
-pub struct Last {
+pub struct LastReceived {
     /// The receiving socket; 0 = the datagram was not RTPS.
     pub socket: Shared<u64>,
     /// The datagram's token: equal to `scratch(slot).walk.record.datagram` unless the slot was
     /// reused.
     pub token: Shared<u32>,
-    /// Slot of the working memory with the datagram's records, see `Scratch::count`.
+    /// Slot of the working memory with the datagram's records, see `Scratch::record_count`.
     pub slot: Shared<u32>,
     /// 1 = captured: the slot holds no records.
-    pub captured: Shared<u32>,
+    pub was_captured: Shared<u32>,
     pub unused: u32,
     /// Address of the kernel's packet, by which a drop of the packet is recognized.
-    pub buffer: Shared<u64>,
+    pub skb_address: Shared<u64>,
     /// The socket whose full buffer was already counted for this datagram.
-    pub told: Shared<u64>,
+    pub counted_socket: Shared<u64>,
 }
 
 /// A buffer for one piece of the maximum length.
@@ -326,77 +328,78 @@ pub struct PieceBuffer {
     pub bytes: [u8; PIECE_BYTES as usize],
 }
 
-/// Claims one of the slots for sent datagrams for this run of a program, until [`release`].
+/// Claims one of the slots for sent datagrams for this run of a program, until [`release_slot`].
 ///
 /// Tasks send such datagrams, and other sending tasks may preempt them (the kernel only keeps a
 /// task on its CPU). Atomics that return a value need Linux 5.12, so each run adds 1 to the slot's
 /// claims and then reads them. All runs share a CPU and see the additions in one order, so at most
 /// one run reads 1.
 #[inline(always)]
-pub fn claim_outgoing() -> Option<u32> {
-    claim(OUTGOING_SLOT, SLOTS)
+pub fn claim_egress_slot() -> Option<u32> {
+    claim_slot(FIRST_EGRESS_SLOT, SCRATCH_SLOTS)
 }
 
-/// Claims a slot as [`claim_outgoing`] does, for frames and received datagrams. Programs for these
-/// run with bottom halves disabled, one after the other, except on kernels that preempt such code.
+/// Claims a slot as [`claim_egress_slot`] does, for frames and received datagrams. Programs for
+/// these run with bottom halves disabled, one after the other, except on kernels that preempt such
+/// code.
 #[inline(always)]
-pub fn claim_incoming() -> Option<u32> {
-    if setting(&PREEMPTED) == 0 {
+pub fn claim_ingress_slot() -> Option<u32> {
+    if read_global(&PREEMPTED) == 0 {
         return Some(0);
     }
-    claim(0, OUTGOING_SLOT)
+    claim_slot(0, FIRST_EGRESS_SLOT)
 }
 
 #[inline(always)]
-fn claim(first: u32, end: u32) -> Option<u32> {
+fn claim_slot(first: u32, end: u32) -> Option<u32> {
     let mut slot = first;
     while slot < end {
         if let Some(scratch) = SCRATCH.get_ptr_mut(slot) {
-            // SAFETY: a map value pointer checked against null; only this function and `release`
-            // access `claims`, by its address.
-            let claims = unsafe { &raw mut (*scratch).claims };
-            add(claims, 1);
+            // SAFETY: a map value pointer checked against null; only this function and
+            // `release_slot` access `claim_count`, by its address.
+            let claim_count = unsafe { &raw mut (*scratch).claim_count };
+            atomic_add(claim_count, 1);
             // SAFETY: as above.
-            if unsafe { core::ptr::read_volatile(claims) } == 1 {
+            if unsafe { core::ptr::read_volatile(claim_count) } == 1 {
                 return Some(slot);
             }
-            add(claims, u64::MAX);
+            atomic_add(claim_count, u64::MAX);
         }
         slot += 1;
     }
-    count_outside(Counter::Contended, 1);
+    count_without_slot(Counter::Contended, 1);
     None
 }
 
 /// Releases a slot.
 #[inline(always)]
-pub fn release(slot: u32) {
-    if setting(&PREEMPTED) == 0 && slot < OUTGOING_SLOT {
+pub fn release_slot(slot: u32) {
+    if read_global(&PREEMPTED) == 0 && slot < FIRST_EGRESS_SLOT {
         return;
     }
     if let Some(scratch) = SCRATCH.get_ptr_mut(slot) {
         // SAFETY: a map value pointer checked against null.
-        add(unsafe { &raw mut (*scratch).claims }, u64::MAX);
+        atomic_add(unsafe { &raw mut (*scratch).claim_count }, u64::MAX);
     }
 }
 
 /// Working memory of a run, in a map. A reference to it lasts for one access, and a called function
 /// looks the memory up itself.
-pub struct Working<T>(*mut T);
+pub struct ScratchRef<T>(*mut T);
 
-impl<T> Clone for Working<T> {
+impl<T> Clone for ScratchRef<T> {
     #[inline(always)]
     fn clone(&self) -> Self {
         *self
     }
 }
 
-impl<T> Copy for Working<T> {}
+impl<T> Copy for ScratchRef<T> {}
 
-impl<T> Working<T> {
+impl<T> ScratchRef<T> {
     /// Returns the value of an entry of a map, which the caller has claimed.
     #[inline(always)]
-    pub fn of(map: &PerCpuArray<T>, index: u32) -> Option<Self> {
+    pub fn lookup(map: &PerCpuArray<T>, index: u32) -> Option<Self> {
         map.get_ptr_mut(index).map(Self)
     }
 
@@ -407,7 +410,7 @@ impl<T> Working<T> {
     }
 }
 
-impl<T> Deref for Working<T> {
+impl<T> Deref for ScratchRef<T> {
     type Target = T;
 
     #[inline(always)]
@@ -418,7 +421,7 @@ impl<T> Deref for Working<T> {
     }
 }
 
-impl<T> DerefMut for Working<T> {
+impl<T> DerefMut for ScratchRef<T> {
     #[inline(always)]
     fn deref_mut(&mut self) -> &mut T {
         // SAFETY: as above.
@@ -428,47 +431,48 @@ impl<T> DerefMut for Working<T> {
 
 /// Returns the working memory of a slot.
 #[inline(always)]
-pub fn scratch(slot: u32) -> Option<Working<Scratch>> {
-    Working::of(&SCRATCH, slot)
+pub fn scratch(slot: u32) -> Option<ScratchRef<Scratch>> {
+    ScratchRef::lookup(&SCRATCH, slot)
 }
 
 /// Returns the keys of a slot.
 #[inline(always)]
-pub fn run_keys(slot: u32) -> Option<Working<RunKeys>> {
-    Working::of(&RUN_KEYS, slot)
+pub fn run_keys(slot: u32) -> Option<ScratchRef<RunKeys>> {
+    ScratchRef::lookup(&RUN_KEYS, slot)
 }
 
 /// Returns the piece buffer of a slot.
 #[inline(always)]
-pub fn piece(slot: u32) -> Option<Working<PieceBuffer>> {
-    Working::of(&PIECE, slot)
+pub fn piece_buffer(slot: u32) -> Option<ScratchRef<PieceBuffer>> {
+    ScratchRef::lookup(&PIECE, slot)
 }
 
 /// Returns the run with this key, if it exists.
 #[inline(always)]
-pub fn run(key: &RunKey) -> Option<&'static Shared<Record>> {
-    // SAFETY: a map value pointer checked against null; a `Shared<Record>` is laid out as a `Record`.
+pub fn fragment_run(key: &RunKey) -> Option<&'static Shared<Record>> {
+    // SAFETY: a map value pointer checked against null; a `Shared<Record>` is laid out as a
+    // `Record`.
     RUNS.get_ptr_mut(key).map(|run| unsafe { &*run.cast() })
 }
 
 /// Returns the entry for captures with this hash. Runs that interrupt each other here may capture
 /// one more copy. They may also store a mixture of two captures, which matches no datagram.
 #[inline(always)]
-pub fn recent(hash: u32) -> Option<&'static Recent> {
+pub fn recent_capture(hash: u32) -> Option<&'static RecentCapture> {
     RECENT.get(hash & (RECENT_CAPACITY - 1))
 }
 
 /// Returns this CPU's last received datagram. A CPU handles received datagrams one after the other.
 /// A program for a dropped packet may read the value between two of them.
 #[inline(always)]
-pub fn last() -> Option<&'static Last> {
+pub fn last_received() -> Option<&'static LastReceived> {
     LAST.get(0)
 }
 
 /// Adds to a counter of this CPU and slot.
 #[inline(always)]
 pub fn count(slot: u32, counter: Counter, by: u64) {
-    if let Some(counter) = counter_of(slot, counter) {
+    if let Some(counter) = counter_ptr(slot, counter) {
         // SAFETY: in a map value, of a slot that this run holds.
         unsafe { *counter += by }
     }
@@ -476,16 +480,16 @@ pub fn count(slot: u32, counter: Counter, by: u64) {
 
 /// Adds to a counter of this CPU outside of slots.
 #[inline(always)]
-pub fn count_outside(counter: Counter, by: u64) {
-    if let Some(counter) = counter_of(SLOTS, counter) {
-        add(counter, by);
+pub fn count_without_slot(counter: Counter, by: u64) {
+    if let Some(counter) = counter_ptr(SCRATCH_SLOTS, counter) {
+        atomic_add(counter, by);
     }
 }
 
 #[inline(always)]
-fn counter_of(slot: u32, counter: Counter) -> Option<*mut u64> {
+fn counter_ptr(slot: u32, counter: Counter) -> Option<*mut u64> {
     let counters = COUNTERS.get_ptr_mut(0)?;
-    let slot = opaque(slot) as usize & (COUNTER_SLOTS - 1);
+    let slot = hide_bounds(slot) as usize & (COUNTER_SLOTS - 1);
     let index = slot * Counter::ALL.len() + counter as usize;
     // SAFETY: a map value pointer checked against null, and an index within the value.
     Some(unsafe { counters.cast::<u64>().add(index) })

@@ -6,19 +6,19 @@ use ros2probe_wire::{filter::Counter, walk};
 
 use crate::{
     PACKET_OUTGOING,
-    instructions::opaque,
+    instructions::hide_bounds,
     maps::{IN_PLACE, Packet, count, scratch},
-    settings::setting,
+    settings::read_global,
 };
 
-/// Maximum offset at which [`in_place`] reads, because the verifier requires a bound.
-const IN_PLACE_BYTES: usize = 0x7fff;
+/// Maximum offset at which [`load_direct`] reads, because the verifier requires a bound.
+const MAX_DIRECT_OFFSET: usize = 0x7fff;
 
-/// The hook at which a program sees a packet. The values are `u32`, because functions of BPF take and
-/// return integers.
+/// The hook at which a program sees a packet. The values are `u32`, because functions of BPF take
+/// and return integers.
 pub mod hook {
     /// A frame on an interface.
-    pub const WIRE: u32 = 0;
+    pub const INTERFACE: u32 = 0;
     /// A received datagram at its socket.
     pub const INGRESS: u32 = 1;
     /// A sent datagram at its socket.
@@ -29,8 +29,8 @@ const UDP: u32 = 17;
 /// Third word of an IPv4-mapped address, in memory order.
 pub const IPV4_MAPPED: u32 = u32::from_ne_bytes([0, 0, 0xff, 0xff]);
 /// EtherTypes 802.1Q and 802.1ad, as `skb->protocol` holds them.
-const VLAN: u32 = 0x8100_u16.to_be() as u32;
-const SERVICE_VLAN: u32 = 0x88a8_u16.to_be() as u32;
+const ETH_P_8021Q: u32 = 0x8100_u16.to_be() as u32;
+const ETH_P_8021AD: u32 = 0x88a8_u16.to_be() as u32;
 
 /// The UDP payload as the walk reads it. Payload offset 0 is at `base` of the socket buffer. `base`
 /// wraps for a trailing IP fragment, because the datagram's payload starts before the frame.
@@ -42,28 +42,28 @@ pub struct Payload {
 impl walk::Bytes for Payload {
     #[inline(always)]
     fn words<const N: usize>(&self, offset: u32) -> Option<[u32; N]> {
-        load(self.skb, self.base.wrapping_add(offset))
+        load_bytes(self.skb, self.base.wrapping_add(offset))
     }
 }
 
 /// Copies a plain value out of the socket buffer.
 #[inline(always)]
-pub fn load<T: Copy>(skb: *mut __sk_buff, offset: u32) -> Option<T> {
-    match in_place(skb, offset) {
+pub fn load_bytes<T: Copy>(skb: *mut __sk_buff, offset: u32) -> Option<T> {
+    match load_direct(skb, offset) {
         Some(value) => Some(value),
-        None => load_anywhere(skb, offset),
+        None => load_with_helper(skb, offset),
     }
 }
 
 /// Reads a value from the contiguous part of a datagram, without a helper call.
 #[inline(always)]
-fn in_place<T: Copy>(skb: *mut __sk_buff, offset: u32) -> Option<T> {
-    if setting(&IN_PLACE) == 0 {
+fn load_direct<T: Copy>(skb: *mut __sk_buff, offset: u32) -> Option<T> {
+    if read_global(&IN_PLACE) == 0 {
         // Programs at interfaces may not read in place; for them the verifier skips the code below.
         return None;
     }
-    let offset = opaque(offset) as usize;
-    if offset > IN_PLACE_BYTES {
+    let offset = hide_bounds(offset) as usize;
+    if offset > MAX_DIRECT_OFFSET {
         return None;
     }
     // SAFETY: the verifier rewrites reads of these fields into the addresses.
@@ -78,7 +78,7 @@ fn in_place<T: Copy>(skb: *mut __sk_buff, offset: u32) -> Option<T> {
 }
 
 #[inline(always)]
-fn load_anywhere<T: Copy>(skb: *mut __sk_buff, offset: u32) -> Option<T> {
+fn load_with_helper<T: Copy>(skb: *mut __sk_buff, offset: u32) -> Option<T> {
     let mut value = MaybeUninit::<T>::uninit();
     // SAFETY: the destination has the size given; the kernel checks the offset.
     let result = unsafe {
@@ -99,7 +99,7 @@ fn load_anywhere<T: Copy>(skb: *mut __sk_buff, offset: u32) -> Option<T> {
 /// Returns whether the current packet is an IP fragment; `None` without working memory.
 #[inline(always)]
 pub fn is_fragment(slot: u32) -> Option<bool> {
-    Some(scratch(slot)?.get().packet.fragmented != 0)
+    Some(scratch(slot)?.get().packet.is_fragment != 0)
 }
 
 /// Fills in the scratch packet; returns 1 if the packet is a UDP datagram or a fragment of one.
@@ -107,25 +107,25 @@ pub fn is_fragment(slot: u32) -> Option<bool> {
 // Global (not inlined) functions are verified once each, whatever calls them.
 #[unsafe(no_mangle)]
 #[inline(never)]
-pub extern "C" fn parse(skb: *mut __sk_buff, slot: u32, at: u32) -> u32 {
+pub extern "C" fn parse_ip_packet(skb: *mut __sk_buff, slot: u32, at: u32) -> u32 {
     let Some(mut scratch) = scratch(slot) else {
         return 0;
     };
     let packet = &mut scratch.get().packet;
     // SAFETY: the verifier rewrites reads of these fields.
     let (pkt_type, interface) = unsafe { ((*skb).pkt_type, (*skb).ifindex) };
-    let host = at != hook::WIRE;
+    let host = at != hook::INTERFACE;
     // At a socket the packet type is unusable: a sent datagram does not have it yet.
     let outgoing = if host {
         at == hook::EGRESS
     } else {
         pkt_type == PACKET_OUTGOING
     };
-    packet.host = u32::from(host);
-    packet.outgoing = u32::from(outgoing);
+    packet.is_at_socket = u32::from(host);
+    packet.is_outgoing = u32::from(outgoing);
     packet.interface = interface;
-    let start = if host { 0 } else { start(skb) };
-    let Some(header) = load::<[u32; 5]>(skb, start) else {
+    let start = if host { 0 } else { ip_header_offset(skb) };
+    let Some(header) = load_bytes::<[u32; 5]>(skb, start) else {
         return 0;
     };
     let is_udp = match u32::from_be(header[0]) >> 28 {
@@ -143,10 +143,10 @@ pub extern "C" fn parse(skb: *mut __sk_buff, slot: u32, at: u32) -> u32 {
 /// Returns the offset of the IP header in a frame. The kernel strips the outer VLAN tag of received
 /// frames, but not a second one.
 #[inline(always)]
-pub fn start(skb: *mut __sk_buff) -> u32 {
+pub fn ip_header_offset(skb: *mut __sk_buff) -> u32 {
     // SAFETY: the verifier rewrites reads of these fields.
     let (pkt_type, protocol) = unsafe { ((*skb).pkt_type, (*skb).protocol) };
-    if pkt_type != PACKET_OUTGOING && (protocol == VLAN || protocol == SERVICE_VLAN) {
+    if pkt_type != PACKET_OUTGOING && (protocol == ETH_P_8021Q || protocol == ETH_P_8021AD) {
         4
     } else {
         0
@@ -170,62 +170,62 @@ fn ipv4(header: [u32; 5], start: u32, packet: &mut Packet) -> Option<()> {
     if header < 20 || total < header {
         return None;
     }
-    packet.body = start + header;
+    packet.payload_offset = start + header;
     packet.len = total - header;
-    packet.offset = (second & 0x1fff) * 8;
-    packet.more = second >> 13 & 1;
+    packet.fragment_offset = (second & 0x1fff) * 8;
+    packet.more_fragments = second >> 13 & 1;
     packet.identification = second >> 16;
-    packet.fragmented = u32::from(second & 0x3fff != 0);
-    packet.ipv6 = 0;
+    packet.is_fragment = u32::from(second & 0x3fff != 0);
+    packet.is_ipv6 = 0;
     packet.source = [0, 0, IPV4_MAPPED, source];
     packet.destination = [0, 0, IPV4_MAPPED, destination];
     Some(())
 }
 
-/// Reads an IPv6 header (RFC 8200) with up to eight extension headers.
+/// Reads an IPv6 header (RFC 8200) with up to seven extension headers.
 #[inline(always)]
 fn ipv6(skb: *mut __sk_buff, start: u32, packet: &mut Packet) -> Option<()> {
-    let header: [u32; 10] = load(skb, start)?;
+    let header: [u32; 10] = load_bytes(skb, start)?;
     let lengths = u32::from_be(header[1]);
     packet.source = [header[2], header[3], header[4], header[5]];
     packet.destination = [header[6], header[7], header[8], header[9]];
-    packet.ipv6 = 1;
+    packet.is_ipv6 = 1;
     // This zero is hidden from the compiler, which would turn four consecutive zeros into a call of
     // `memset`.
     let zero = core::hint::black_box(0);
-    packet.offset = zero;
-    packet.more = zero;
+    packet.fragment_offset = zero;
+    packet.more_fragments = zero;
     packet.identification = zero;
-    packet.fragmented = zero;
+    packet.is_fragment = zero;
     let end = start + 40 + (lengths >> 16);
-    let mut next = lengths >> 8 & 0xff;
+    let mut next_header = lengths >> 8 & 0xff;
     let mut at = start + 40;
     let mut extensions = 0;
     while extensions < 8 {
-        if next == UDP {
+        if next_header == UDP {
             if at > end {
                 return None;
             }
-            packet.body = at;
+            packet.payload_offset = at;
             packet.len = end - at;
             return Some(());
         }
-        if packet.offset != 0 {
+        if packet.fragment_offset != 0 {
             // Only the first fragment has further headers.
             return None;
         }
-        let [word, second]: [u32; 2] = load(skb, at)?;
+        let [word, second]: [u32; 2] = load_bytes(skb, at)?;
         let word = u32::from_be(word);
-        match next {
+        match next_header {
             // Hop-by-hop, routing, destination options: the length counts 8-byte units beyond the
             // first 8 bytes.
             0 | 43 | 60 => at += ((word >> 16 & 0xff) + 1) * 8,
             44 => {
-                packet.fragmented = u32::from(word & 0xfff9 != 0);
+                packet.is_fragment = u32::from(word & 0xfff9 != 0);
                 // The offset counts 8-byte units and is shifted left by three bits: the masked
                 // value is in bytes.
-                packet.offset = word & 0xfff8;
-                packet.more = word & 1;
+                packet.fragment_offset = word & 0xfff8;
+                packet.more_fragments = word & 1;
                 packet.identification = u32::from_be(second);
                 at += 8;
             }
@@ -233,7 +233,7 @@ fn ipv6(skb: *mut __sk_buff, start: u32, packet: &mut Packet) -> Option<()> {
             51 => at += ((word >> 16 & 0xff) + 2) * 4,
             _ => return None,
         }
-        next = word >> 24;
+        next_header = word >> 24;
         extensions += 1;
     }
     None

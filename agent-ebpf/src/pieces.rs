@@ -10,15 +10,15 @@ use ros2probe_wire::{
 };
 
 use crate::{
-    instructions::opaque,
-    maps::{PIECES, PieceBuffer, WAKE_PIECE_BYTES, count, piece, scratch},
-    settings::setting,
-    verdict::{AVAILABLE_DATA, FORCE_WAKEUP, NO_WAKEUP},
+    instructions::hide_bounds,
+    maps::{PIECES, PieceBuffer, WAKE_PIECE_BYTES, count, piece_buffer, scratch},
+    settings::read_global,
+    verdict::{FORCE_WAKEUP, NO_WAKEUP, RING_AVAIL_DATA},
 };
 
 /// Maximum number of pieces of a UDP datagram.
 const PIECES_PER_DATAGRAM: u32 = 65_536 / PIECE_BYTES;
-const OF_THE_DATAGRAM: u16 = flag::FRAGMENTED | flag::OUTGOING | flag::IPV6 | flag::HOST;
+const DATAGRAM_FLAGS: u16 = flag::FRAGMENTED | flag::OUTGOING | flag::IPV6 | flag::HOST;
 
 /// Writer of participant announcements. Participants repeat their announcements, so these do not
 /// wake user space. Every other captured datagram is sent once, and user space should read it
@@ -30,13 +30,13 @@ const _: () = assert!(PIECE_BYTES.is_power_of_two());
 /// Writes the current datagram to the ring; returns 1 if every piece fit.
 #[unsafe(no_mangle)]
 #[inline(never)]
-pub extern "C" fn capture(skb: *mut __sk_buff, slot: u32) -> u32 {
-    let (Some(mut scratch), Some(mut buffer)) = (scratch(slot), piece(slot)) else {
+pub extern "C" fn write_capture(skb: *mut __sk_buff, slot: u32) -> u32 {
+    let (Some(mut scratch), Some(mut buffer)) = (scratch(slot), piece_buffer(slot)) else {
         return 0;
     };
     let scratch = scratch.get();
     let (record, packet, piece) = (&scratch.walk.record, &scratch.packet, &mut buffer.piece);
-    piece.time = packet.now;
+    piece.time = packet.time_ns;
     piece.socket = record.socket;
     piece.source = packet.source;
     piece.destination = packet.destination;
@@ -45,20 +45,20 @@ pub extern "C" fn capture(skb: *mut __sk_buff, slot: u32) -> u32 {
     piece.interface = packet.interface;
     piece.datagram = record.datagram;
     piece.datagram_len = scratch.walk.datagram_len;
-    piece.flags = record.flags & OF_THE_DATAGRAM;
+    piece.flags = record.flags & DATAGRAM_FLAGS;
     let len = scratch.walk.datagram_len;
-    let base = packet.body + 8;
-    let (mut offset, mut number) = (0, 0);
-    while number < PIECES_PER_DATAGRAM {
+    let base = packet.payload_offset + 8;
+    let (mut offset, mut piece_count) = (0, 0);
+    while piece_count < PIECES_PER_DATAGRAM {
         if offset >= len {
             break;
         }
-        if hand_over(skb, slot, base, offset) == 0 {
+        if write_piece(skb, slot, base, offset) == 0 {
             count(slot, Counter::PiecesLost, 1);
             return 0;
         }
         offset += PIECE_BYTES;
-        number += 1;
+        piece_count += 1;
     }
     count(slot, Counter::CapturedBytes, u64::from(len));
     1
@@ -67,45 +67,45 @@ pub extern "C" fn capture(skb: *mut __sk_buff, slot: u32) -> u32 {
 /// Writes one piece, from `offset` of the payload at `base`; returns 1 if it fit.
 #[unsafe(no_mangle)]
 #[inline(never)]
-pub extern "C" fn hand_over(skb: *mut __sk_buff, slot: u32, base: u32, offset: u32) -> u32 {
-    let Some(mut buffer) = piece(slot) else {
+pub extern "C" fn write_piece(skb: *mut __sk_buff, slot: u32, base: u32, offset: u32) -> u32 {
+    let Some(mut buffer) = piece_buffer(slot) else {
         return 0;
     };
-    let left = buffer.piece.datagram_len.wrapping_sub(offset);
-    let len = if left > PIECE_BYTES {
+    let remaining = buffer.piece.datagram_len.wrapping_sub(offset);
+    let len = if remaining > PIECE_BYTES {
         PIECE_BYTES
     } else {
-        left
+        remaining
     };
     buffer.piece.offset = offset;
     buffer.piece.len = len;
     // SAFETY: the buffer can hold the longest piece.
-    let loaded = unsafe {
+    let status = unsafe {
         bpf_skb_load_bytes(
             skb.cast(),
             base.wrapping_add(offset),
             buffer.bytes.as_mut_ptr().cast(),
-            bounded(len) as u32,
+            bounded_piece_len(len) as u32,
         )
     };
-    if loaded != 0 {
+    if status != 0 {
         return 0;
     }
-    publish(slot, &mut buffer)
+    push_piece(slot, &mut buffer)
 }
 
 /// Writes the piece in the buffer; returns 1 if it fit.
 #[inline(always)]
-pub fn publish(slot: u32, buffer: &mut PieceBuffer) -> u32 {
+pub fn push_piece(slot: u32, buffer: &mut PieceBuffer) -> u32 {
     let wake = if scratch(slot)
         .is_some_and(|mut scratch| scratch.get().walk.record.writer[3] != SPDP_WRITER)
-        || PIECES.query(AVAILABLE_DATA) > setting(&WAKE_PIECE_BYTES)
+        || PIECES.query(RING_AVAIL_DATA) > read_global(&WAKE_PIECE_BYTES)
     {
         FORCE_WAKEUP
     } else {
         NO_WAKEUP
     };
-    let size = size_of::<Piece>() + bounded(buffer.piece.len);
+    let size = size_of::<Piece>() + bounded_piece_len(buffer.piece.len);
     // SAFETY: the buffer is that long.
     let bytes = unsafe { core::slice::from_raw_parts((&raw const *buffer).cast::<u8>(), size) };
     u32::from(PIECES.output::<[u8]>(bytes, wake).is_ok())
@@ -114,7 +114,7 @@ pub fn publish(slot: u32, buffer: &mut PieceBuffer) -> u32 {
 /// Returns `len`, which must be 1 to [`PIECE_BYTES`], with bounds that every verifier recognizes.
 /// The mask stands directly before the use, and the optimizer must not remove it as redundant.
 #[inline(always)]
-pub fn bounded(len: u32) -> usize {
-    let len = opaque(len);
+pub fn bounded_piece_len(len: u32) -> usize {
+    let len = hide_bounds(len);
     ((len.wrapping_sub(1) & (PIECE_BYTES as u64 - 1)) + 1) as usize
 }

@@ -1,6 +1,6 @@
 //! Arguments of a call, from the registers that the kernel saved at its entry.
 
-use crate::settings::setting;
+use crate::settings::read_global;
 
 /// Architecture of the saved registers: 0 = x86-64, 1 = AArch64. Set by the loader.
 #[unsafe(no_mangle)]
@@ -31,5 +31,5 @@ pub(crate) use register;
 /// Returns whether the registers are those of AArch64.
 #[inline(always)]
 pub fn is_aarch64() -> bool {
-    setting(&ARCHITECTURE) == AARCH64
+    read_global(&ARCHITECTURE) == AARCH64
 }

@@ -4,7 +4,7 @@
 use aya_ebpf::helpers::generated::bpf_get_current_ancestor_cgroup_id;
 
 /// Maximum number of ancestor control groups that are compared.
-const LEVELS: i32 = 16;
+const MAX_CGROUP_DEPTH: i32 = 16;
 
 /// Id of the control group in or below which processes are observed; 0 = all processes. Set by the
 /// loader.
@@ -13,22 +13,22 @@ pub static WITHIN: u64 = 0;
 
 /// Reads a constant that the loader may have changed.
 #[inline(always)]
-pub fn setting<T: Copy>(constant: &'static T) -> T {
+pub fn read_global<T: Copy>(global: &'static T) -> T {
     // SAFETY: a constant of the loaded object, never written while the program runs.
-    unsafe { core::ptr::read_volatile(constant) }
+    unsafe { core::ptr::read_volatile(global) }
 }
 
 /// Returns whether the running process is in the observed control group.
 #[inline(always)]
-pub fn is_within() -> bool {
-    let within = setting(&WITHIN);
-    if within == 0 {
+pub fn is_in_target_cgroup() -> bool {
+    let target = read_global(&WITHIN);
+    if target == 0 {
         return true;
     }
     let mut level = 0;
-    while level < LEVELS {
+    while level < MAX_CGROUP_DEPTH {
         // SAFETY: no preconditions.
-        if unsafe { bpf_get_current_ancestor_cgroup_id(level) } == within {
+        if unsafe { bpf_get_current_ancestor_cgroup_id(level) } == target {
             return true;
         }
         level += 1;

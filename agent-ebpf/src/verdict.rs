@@ -9,33 +9,34 @@ use ros2probe_wire::{
 
 use crate::{
     host,
-    instructions::opaque,
+    instructions::hide_bounds,
     maps::{
         BUDGET, INTEREST, PARTICIPANTS, RECORDS, RECORDS_PER_DATAGRAM, Scratch, Shared, UNKNOWN,
-        WAKE_BYTES, copy, count, count_outside, scratch,
+        WAKE_BYTES, copy, count, count_without_slot, scratch,
     },
-    packet::{Payload, load},
+    packet::{Payload, load_bytes},
     runs,
-    settings::setting,
+    settings::read_global,
     zenoh,
 };
 
 /// Maximum number of submessages that one run of the program reads; a datagram with more is
 /// captured.
-const SUBMESSAGES: u32 = 64;
+const MAX_SUBMESSAGES: u32 = 64;
 /// Minimum interval between two notes of a participant's time. Leases last seconds.
-const HEARD_NANOSECONDS: u64 = 10_000_000;
+const LAST_SEEN_INTERVAL_NS: u64 = 10_000_000;
 /// `BPF_RB_NO_WAKEUP`, `BPF_RB_FORCE_WAKEUP`, `BPF_RB_AVAIL_DATA`.
 pub const NO_WAKEUP: u64 = 1;
 pub const FORCE_WAKEUP: u64 = 2;
-pub const AVAILABLE_DATA: u64 = 0;
+pub const RING_AVAIL_DATA: u64 = 0;
 
-/// Results of [`advance`]. The values are `u32`, because functions of BPF take and return integers.
+/// Results of [`walk_submessage`]. The values are `u32`, because functions of BPF take and return
+/// integers.
 pub mod progress {
     /// More submessages may follow in this frame.
-    pub const ON: u32 = 0;
+    pub const CONTINUE: u32 = 0;
     /// No more submessages can be read in this frame.
-    pub const STOP: u32 = 1;
+    pub const FRAME_DONE: u32 = 1;
     /// User space must read the datagram.
     pub const CAPTURE: u32 = 2;
     /// The submessage continues in a later fragment: user space must read it.
@@ -45,24 +46,24 @@ pub mod progress {
 /// Handles a datagram in one frame; returns 1 to keep the frame.
 #[unsafe(no_mangle)]
 #[inline(never)]
-pub extern "C" fn whole(skb: *mut __sk_buff, slot: u32) -> u32 {
+pub extern "C" fn decide_datagram(skb: *mut __sk_buff, slot: u32) -> u32 {
     let Some(mut scratch) = scratch(slot) else {
         return 0;
     };
-    if begin(skb, slot, scratch.get()).is_none() {
+    if start_walk(skb, slot, scratch.get()).is_none() {
         return zenoh::quic(skb, slot);
     }
-    let begun = scratch.get();
-    let (base, present) = (begun.packet.body + 8, begun.walk.datagram_len);
-    if present + 8 > begun.packet.len {
+    let current = scratch.get();
+    let (base, available_len) = (current.packet.payload_offset + 8, current.walk.datagram_len);
+    if available_len + 8 > current.packet.len {
         count(slot, Counter::Malformed, 1);
         return 0;
     }
-    if run(skb, base, present, slot) >= progress::CAPTURE {
-        captured(slot, scratch.get());
+    if walk_frame(skb, base, available_len, slot) >= progress::CAPTURE {
+        count_capture(slot, scratch.get());
         return 1;
     }
-    let records = scratch.get().count;
+    let records = scratch.get().record_count;
     count(
         slot,
         if records == 0 {
@@ -72,43 +73,44 @@ pub extern "C" fn whole(skb: *mut __sk_buff, slot: u32) -> u32 {
         },
         1,
     );
-    flush(records, 0, slot);
+    write_records(records, 0, slot);
     0
 }
 
-/// Walks a datagram again that did not fit the ring, as if a copy had been captured. Its
+/// Walks the datagram again after the ring had no room for it, as if it were captured. Its
 /// submessages of interest become records.
 #[unsafe(no_mangle)]
 #[inline(never)]
-pub extern "C" fn meter(skb: *mut __sk_buff, slot: u32) -> u32 {
+pub extern "C" fn meter_datagram(skb: *mut __sk_buff, slot: u32) -> u32 {
     let Some(mut scratch) = scratch(slot) else {
         return 0;
     };
-    let begun = scratch.get();
-    let base = begun.packet.body + 8;
-    let Some([_magic, _version, source @ ..]): Option<[u32; 5]> = load(skb, base) else {
+    let current = scratch.get();
+    let base = current.packet.payload_offset + 8;
+    let Some([_magic, _version, source @ ..]): Option<[u32; 5]> = load_bytes(skb, base) else {
         return 0;
     };
-    begun.count = 0;
-    begun.unknown = 0;
-    begun.repeated = 1;
-    let len = begun.walk.datagram_len;
-    begun.walk.begin(source, len);
-    run(skb, base, len, slot);
-    let records = scratch.get().count;
-    flush(records, 0, slot);
+    current.record_count = 0;
+    current.is_unknown_writer = 0;
+    current.is_duplicate = 1;
+    let len = current.walk.datagram_len;
+    current.walk.begin(source, len);
+    walk_frame(skb, base, len, slot);
+    let records = scratch.get().record_count;
+    write_records(records, 0, slot);
     0
 }
 
 /// Reads the UDP and RTPS headers of the current packet and starts the walk; `None` if the packet
 /// is not RTPS.
 #[inline(always)]
-pub fn begin(skb: *mut __sk_buff, slot: u32, scratch: &mut Scratch) -> Option<()> {
+pub fn start_walk(skb: *mut __sk_buff, slot: u32, scratch: &mut Scratch) -> Option<()> {
     let packet = &scratch.packet;
     if packet.len < 8 + walk::HEADER_LEN {
         return None;
     }
-    let [ports, lengths, magic, _version, source @ ..]: [u32; 7] = load(skb, packet.body)?;
+    let [ports, lengths, magic, _version, source @ ..]: [u32; 7] =
+        load_bytes(skb, packet.payload_offset)?;
     if magic != MAGIC {
         return None;
     }
@@ -118,27 +120,31 @@ pub fn begin(skb: *mut __sk_buff, slot: u32, scratch: &mut Scratch) -> Option<()
         count(slot, Counter::Malformed, 1);
         return None;
     }
-    if packet.fragmented == 0 {
+    if packet.is_fragment == 0 {
         // SAFETY: no preconditions.
-        scratch.packet.now = unsafe { bpf_ktime_get_ns() };
+        scratch.packet.time_ns = unsafe { bpf_ktime_get_ns() };
     }
     let packet = &scratch.packet;
-    let (now, destination, interface) = (packet.now, packet.destination, packet.interface);
-    let flags = (if packet.fragmented != 0 {
+    let (now, destination, interface) = (packet.time_ns, packet.destination, packet.interface);
+    let flags = (if packet.is_fragment != 0 {
         flag::FRAGMENTED
     } else {
         0
-    }) | (if packet.outgoing != 0 {
+    }) | (if packet.is_outgoing != 0 {
         flag::OUTGOING
     } else {
         0
-    }) | (if packet.ipv6 != 0 { flag::IPV6 } else { 0 })
-        | (if packet.host != 0 { flag::HOST } else { 0 });
-    scratch.count = 0;
-    scratch.unknown = 0;
-    scratch.repeated = 0;
-    let (token, socket) = if packet.host != 0 {
-        host::identify(skb, slot, &mut scratch.named)
+    }) | (if packet.is_ipv6 != 0 { flag::IPV6 } else { 0 })
+        | (if packet.is_at_socket != 0 {
+            flag::HOST
+        } else {
+            0
+        });
+    scratch.record_count = 0;
+    scratch.is_unknown_writer = 0;
+    scratch.is_duplicate = 0;
+    let (token, socket) = if packet.is_at_socket != 0 {
+        host::assign_token(skb, slot, &mut scratch.token_count)
     } else {
         (0, 0)
     };
@@ -154,36 +160,36 @@ pub fn begin(skb: *mut __sk_buff, slot: u32, scratch: &mut Scratch) -> Option<()
     record.unused = 0;
     record.flags = flags;
     scratch.walk.begin(source, udp_len - 8);
-    heard(scratch, source, now);
+    note_participant_seen(scratch, source, now);
     Some(())
 }
 
 /// Notes the time of a participant's message if user space tracks the participant, at most every 10
 /// ms.
 #[inline(always)]
-pub fn heard(scratch: &mut Scratch, source: [u32; 3], now: u64) {
-    let same = scratch.heard[2] == source[2]
-        && scratch.heard[1] == source[1]
-        && scratch.heard[0] == source[0];
-    if same && now.wrapping_sub(scratch.heard_at) < HEARD_NANOSECONDS {
+pub fn note_participant_seen(scratch: &mut Scratch, source: [u32; 3], now: u64) {
+    let same = scratch.last_participant[2] == source[2]
+        && scratch.last_participant[1] == source[1]
+        && scratch.last_participant[0] == source[0];
+    if same && now.wrapping_sub(scratch.last_participant_ns) < LAST_SEEN_INTERVAL_NS {
         return;
     }
     if let Some(last) = PARTICIPANTS.get_ptr_mut(source) {
         // SAFETY: a map value pointer checked against null; racing writers store the same moment.
         unsafe { *last = now }
     }
-    scratch.heard = source;
-    scratch.heard_at = now;
+    scratch.last_participant = source;
+    scratch.last_participant_ns = now;
 }
 
-/// Walks the submessages that begin before `present`; returns the [`progress`] of the last one that
-/// was walked, or `CAPTURE` if there are too many.
+/// Walks the submessages that begin before `available_len`; returns the [`progress`] of the last
+/// one that was walked, or `CAPTURE` if there are too many.
 #[inline(always)]
-pub fn run(skb: *mut __sk_buff, base: u32, present: u32, slot: u32) -> u32 {
+pub fn walk_frame(skb: *mut __sk_buff, base: u32, available_len: u32, slot: u32) -> u32 {
     let mut submessages = 0;
-    while submessages < SUBMESSAGES {
-        let result = advance(skb, base, present, slot);
-        if result != progress::ON {
+    while submessages < MAX_SUBMESSAGES {
+        let result = walk_submessage(skb, base, available_len, slot);
+        if result != progress::CONTINUE {
             return result;
         }
         submessages += 1;
@@ -194,87 +200,96 @@ pub fn run(skb: *mut __sk_buff, base: u32, present: u32, slot: u32) -> u32 {
 /// Walks one submessage.
 #[unsafe(no_mangle)]
 #[inline(never)]
-pub extern "C" fn advance(skb: *mut __sk_buff, base: u32, present: u32, slot: u32) -> u32 {
+pub extern "C" fn walk_submessage(
+    skb: *mut __sk_buff,
+    base: u32,
+    available_len: u32,
+    slot: u32,
+) -> u32 {
     let Some(mut scratch) = scratch(slot) else {
-        return progress::STOP;
+        return progress::FRAME_DONE;
     };
     let scratch = scratch.get();
-    let before = scratch.walk.offset;
-    let result = match walk::step(&mut scratch.walk, &Payload { skb, base }, present) {
-        Step::End | Step::Later => progress::STOP,
-        Step::Passed => progress::ON,
+    let submessage_offset = scratch.walk.offset;
+    let result = match walk::step(&mut scratch.walk, &Payload { skb, base }, available_len) {
+        Step::End | Step::Later => progress::FRAME_DONE,
+        Step::Passed => progress::CONTINUE,
         Step::Split => progress::SPLIT,
         Step::Malformed => {
             count(slot, Counter::Malformed, 1);
-            progress::STOP
+            progress::FRAME_DONE
         }
-        Step::Endpoint => endpoint(slot, scratch, false),
-        Step::LongGap => endpoint(slot, scratch, true),
+        Step::Endpoint => apply_verdict(slot, scratch, false),
+        Step::LongGap => apply_verdict(slot, scratch, true),
     };
     if result == progress::CAPTURE {
         // User space reads this submessage again.
-        scratch.walk.offset = before;
+        scratch.walk.offset = submessage_offset;
     }
     result
 }
 
 /// Looks up the current submessage in the interest map.
 #[inline(always)]
-pub fn endpoint(slot: u32, scratch: &mut Scratch, long_gap: bool) -> u32 {
-    if joins_last(scratch) {
-        return progress::ON;
+pub fn apply_verdict(slot: u32, scratch: &mut Scratch, long_gap: bool) -> u32 {
+    if merge_into_last_record(scratch) {
+        return progress::CONTINUE;
     }
-    let (key, unknown_counts) = match walk::fate(&scratch.walk.record) {
-        Fate::Ignore => return progress::ON,
-        Fate::Capture if host::captured_before(slot, scratch) => return progress::ON,
+    let (key, is_writer) = match walk::fate(&scratch.walk.record) {
+        Fate::Ignore => return progress::CONTINUE,
+        Fate::Capture if host::is_duplicate_capture(slot, scratch) => return progress::CONTINUE,
         Fate::Capture => return progress::CAPTURE,
         Fate::Writer => (scratch.walk.record.writer, true),
         Fate::Reader => (scratch.walk.record.reader, false),
     };
-    scratch.classified = 1;
+    scratch.last_endpoint_is_classified = 1;
     let meter = match INTEREST.get_ptr(key) {
         // SAFETY: a map value pointer checked against null.
         Some(verdict) => match unsafe { *verdict } {
             verdict if verdict == Verdict::Capture as u32 => {
-                if !host::captured_before(slot, scratch) {
+                if !host::is_duplicate_capture(slot, scratch) {
                     return progress::CAPTURE;
                 }
                 true
             }
             verdict => verdict == Verdict::Meter as u32,
         },
-        None if unknown_counts => {
-            scratch.classified = 0;
-            match unknown(slot, scratch, key) {
+        None if is_writer => {
+            scratch.last_endpoint_is_classified = 0;
+            match charge_unknown_submessage(slot, scratch, key) {
                 progress::CAPTURE => return progress::CAPTURE,
-                admitted => admitted == progress::STOP,
+                admitted => admitted == progress::FRAME_DONE,
             }
         }
         None => false,
     };
     if !meter {
-        return progress::ON;
+        return progress::CONTINUE;
     }
-    let index = scratch.count;
+    let index = scratch.record_count;
     if long_gap || index >= RECORDS_PER_DATAGRAM {
         return progress::CAPTURE;
     }
     if let Some(slot) = scratch.records.get_mut(index as usize) {
         copy(&scratch.walk.record, slot);
     }
-    scratch.count = index + 1;
-    progress::ON
+    scratch.record_count = index + 1;
+    progress::CONTINUE
 }
 
 /// Adds the current submessage to the last record if it holds the next fragments of the same
 /// sample. Returns whether it holds them. Cyclone DDS sends ten DATA_FRAGs in a datagram.
 #[inline(always)]
-fn joins_last(scratch: &mut Scratch) -> bool {
+fn merge_into_last_record(scratch: &mut Scratch) -> bool {
     let record = &scratch.walk.record;
-    if record.kind != kind::DATA_FRAG || scratch.count == 0 || scratch.classified == 0 {
+    if record.kind != kind::DATA_FRAG
+        || scratch.record_count == 0
+        || scratch.last_endpoint_is_classified == 0
+    {
         return false;
     }
-    let index = opaque(scratch.count - 1) as usize & (RECORDS_PER_DATAGRAM as usize - 1);
+    let index =
+        hide_bounds(scratch.record_count - 1) as usize & (RECORDS_PER_DATAGRAM as usize - 1);
     let Some(last) = scratch.records.get_mut(index) else {
         return false;
     };
@@ -287,87 +302,90 @@ fn joins_last(scratch: &mut Scratch) -> bool {
 }
 
 /// Handles a writer that user space has not classified. Returns `CAPTURE` within the writer's
-/// budget, then `STOP` for one record, then `ON` for no record.
+/// budget, then `FRAME_DONE` for one record, then `CONTINUE` for no record.
 #[inline(always)]
-fn unknown(slot: u32, scratch: &mut Scratch, key: [u32; 4]) -> u32 {
+fn charge_unknown_submessage(slot: u32, scratch: &mut Scratch, key: [u32; 4]) -> u32 {
     let len = scratch.walk.datagram_len;
     // SAFETY: the memory of an LRU entry stays valid when the entry is reused for another key; two
     // writers then share one charge.
-    let used = match unsafe { UNKNOWN.get(key) } {
-        Some(used) => used,
+    let charged = match unsafe { UNKNOWN.get(key) } {
+        Some(charged) => charged,
         None => {
             let _ = UNKNOWN.insert(key, Shared::new(0), 0);
             // SAFETY: as above.
             match unsafe { UNKNOWN.get(key) } {
-                Some(used) => used,
-                None => return progress::ON,
+                Some(charged) => charged,
+                None => return progress::CONTINUE,
             }
         }
     };
-    let so_far = used.get();
-    if so_far < UNKNOWN_CAPTURE_BYTES && !host::captured_before(slot, scratch) && charge(len) {
-        used.set(so_far + len);
-        scratch.unknown = 1;
+    let charged_bytes = charged.get();
+    if charged_bytes < UNKNOWN_CAPTURE_BYTES
+        && !host::is_duplicate_capture(slot, scratch)
+        && charge_capture_budget(len)
+    {
+        charged.set(charged_bytes + len);
+        scratch.is_unknown_writer = 1;
         return progress::CAPTURE;
     }
-    if spend(Budget::Records, 1) {
+    if try_spend(Budget::Records, 1) {
         count(slot, Counter::MeteredUnknown, 1);
-        return progress::STOP;
+        return progress::FRAME_DONE;
     }
     count(slot, Counter::UnknownOverBudget, 1);
-    progress::ON
+    progress::CONTINUE
 }
 
 /// Charges bytes of an unclassified writer to its own budget and to the common one; returns whether
 /// any was left of both.
 #[inline(always)]
-pub fn charge_unknown(writer: &[u32; 4], len: u32) -> bool {
-    // SAFETY: as in `unknown`.
-    let used = match unsafe { UNKNOWN.get(writer) } {
-        Some(used) => used,
+pub fn charge_unknown_writer(writer: &[u32; 4], len: u32) -> bool {
+    // SAFETY: as in `charge_unknown_submessage`.
+    let charged = match unsafe { UNKNOWN.get(writer) } {
+        Some(charged) => charged,
         None => {
             let _ = UNKNOWN.insert(writer, Shared::new(0), 0);
             // SAFETY: as above.
             match unsafe { UNKNOWN.get(writer) } {
-                Some(used) => used,
+                Some(charged) => charged,
                 None => return false,
             }
         }
     };
-    let so_far = used.get();
-    if so_far >= UNKNOWN_CAPTURE_BYTES || !charge(len) {
+    let charged_bytes = charged.get();
+    if charged_bytes >= UNKNOWN_CAPTURE_BYTES || !charge_capture_budget(len) {
         return false;
     }
-    used.set(so_far + len);
+    charged.set(charged_bytes + len);
     true
 }
 
 /// Charges bytes of unclassified traffic to the capture budget; returns whether any budget was
 /// left.
 #[inline(always)]
-pub fn charge(len: u32) -> bool {
-    spend(Budget::CaptureBytes, len)
+pub fn charge_capture_budget(len: u32) -> bool {
+    try_spend(Budget::CaptureBytes, len)
 }
 
-/// Charges a budget if any of it is left; returns whether any was left. The last charge may overdraw
-/// the budget, and racing CPUs may lose a charge.
+/// Charges a budget if any of it is left; returns whether any was left. The last charge may
+/// overdraw the budget, and racing CPUs may lose a charge.
 #[inline(always)]
-pub fn spend(budget: Budget, amount: u32) -> bool {
+pub fn try_spend(budget: Budget, amount: u32) -> bool {
     let Some(budget) = BUDGET.get(budget as u32) else {
         return false;
     };
-    let left = budget.get();
-    if left > 0 {
-        budget.set(left - i64::from(amount));
+    let remaining = budget.get();
+    if remaining > 0 {
+        budget.set(remaining - i64::from(amount));
     }
-    left > 0
+    remaining > 0
 }
 
 /// Counts a captured datagram.
 #[inline(always)]
-pub fn captured(slot: u32, scratch: &Scratch) {
+pub fn count_capture(slot: u32, scratch: &Scratch) {
     count(slot, Counter::Captured, 1);
-    if scratch.unknown != 0 {
+    if scratch.is_unknown_writer != 0 {
         count(slot, Counter::CapturedUnknown, 1);
     }
 }
@@ -375,13 +393,13 @@ pub fn captured(slot: u32, scratch: &Scratch) {
 /// Writes the first `records` scratch records, adding `flags` to each.
 #[unsafe(no_mangle)]
 #[inline(never)]
-pub extern "C" fn flush(records: u32, flags: u32, slot: u32) -> u32 {
+pub extern "C" fn write_records(records: u32, flags: u32, slot: u32) -> u32 {
     let mut index = 0;
     while index < RECORDS_PER_DATAGRAM {
         if index >= records {
             break;
         }
-        flush_one(index, flags, slot);
+        write_record_at(index, flags, slot);
         index += 1;
     }
     0
@@ -391,37 +409,37 @@ pub extern "C" fn flush(records: u32, flags: u32, slot: u32) -> u32 {
 /// in a loop.
 #[unsafe(no_mangle)]
 #[inline(never)]
-pub extern "C" fn flush_one(index: u32, flags: u32, slot: u32) -> u32 {
-    let index = opaque(index) as usize & (RECORDS_PER_DATAGRAM as usize - 1);
+pub extern "C" fn write_record_at(index: u32, flags: u32, slot: u32) -> u32 {
+    let index = hide_bounds(index) as usize & (RECORDS_PER_DATAGRAM as usize - 1);
     if let Some(mut scratch) = scratch(slot)
         && let Some(record) = scratch.get().records.get_mut(index)
     {
         record.flags |= flags as u16;
-        runs::give(slot, record, flags & u32::from(flag::AHEAD) == 0);
+        runs::write_or_merge(slot, record, flags & u32::from(flag::AHEAD) == 0);
     }
     0
 }
 
 /// Writes one record; wakes user space only when the ring fills up.
 #[inline(always)]
-pub fn write(slot: u32, record: &Record) {
-    count(slot, output(record), 1);
+pub fn write_record(slot: u32, record: &Record) {
+    count(slot, push_record(record), 1);
 }
 
-/// Writes a record as [`write`] does, outside of slots.
+/// Writes a record as [`write_record`] does, outside of slots.
 #[inline(always)]
-pub fn write_outside(record: &Record) {
-    count_outside(output(record), 1);
+pub fn write_record_without_slot(record: &Record) {
+    count_without_slot(push_record(record), 1);
 }
 
 #[inline(always)]
-fn output(record: &Record) -> Counter {
-    let wake = if RECORDS.query(AVAILABLE_DATA) > setting(&WAKE_BYTES) {
+fn push_record(record: &Record) -> Counter {
+    let wakeup_flag = if RECORDS.query(RING_AVAIL_DATA) > read_global(&WAKE_BYTES) {
         FORCE_WAKEUP
     } else {
         NO_WAKEUP
     };
-    if RECORDS.output::<Record>(record, wake).is_ok() {
+    if RECORDS.output::<Record>(record, wakeup_flag).is_ok() {
         Counter::Records
     } else {
         Counter::RecordsLost

@@ -30,9 +30,9 @@ pub struct DeliveryKey {
 )]
 #[repr(C)]
 pub struct Delivery {
-    /// Its last datagram was about to enter the socket's receive buffer.
+    /// Time at which the message's last datagram was about to enter the socket's receive buffer.
     pub arrived: u64,
-    /// A thread received that datagram.
+    /// Time at which a thread had received that datagram.
     pub received: u64,
     /// Time for which the receiving thread could run and did not, between the two.
     pub runnable: u64,

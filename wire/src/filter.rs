@@ -50,7 +50,7 @@ pub enum Counter {
     /// Frames or datagrams skipped because too many runs of the program interrupted each other on
     /// one CPU.
     Contended,
-    /// Host hook: captured datagrams with a piece that did not fit the ring.
+    /// Captured datagrams and messages that could not be written to the ring as a whole.
     PiecesLost,
     /// Host hook: copies of a datagram that had just been captured; they are not captured again.
     CopiesNotCaptured,
@@ -79,11 +79,11 @@ pub enum Counter {
     ZenohChunksLost,
     /// Zenoh: losses of the boundary between batches, for example after reordered TCP segments.
     ZenohGaps,
-    /// Zenoh: directions of other TCP connections with a segment that looked like a batch.
+    /// Zenoh: unrecognized directions of TCP connections with a segment that looked like a batch.
     ZenohCandidates,
     /// Zenoh: directions of connections that were recognized.
     ZenohConnections,
-    /// Zenoh, on interfaces: frames of connections copied to user space.
+    /// On interfaces: TCP frames copied to user space.
     ZenohFrames,
     /// RTPS over TCP: directions of connections that were recognized.
     TcpConnections,
@@ -217,7 +217,7 @@ pub const FLOW_CAPACITY: u32 = 1_024;
 pub const INTERFACE_CAPACITY: u32 = 1_024;
 /// Maximum number of incomplete runs of DATA_FRAGs.
 pub const RUN_CAPACITY: u32 = 512;
-/// Maximum number of directions of TCP connections of Zenoh that the filter follows.
+/// Maximum number of directions of recognized TCP connections, of Zenoh or of RTPS.
 pub const CONNECTION_CAPACITY: u32 = 4_096;
 /// Maximum number of directions of other TCP connections in which the filter searches for batches
 /// of Zenoh.

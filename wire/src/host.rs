@@ -53,9 +53,10 @@ pub struct Link {
 
 /// Header of one piece of a captured datagram; the bytes follow. Pieces of one datagram arrive in
 /// order of their offset with the same token, possibly between pieces of other datagrams. If the
-/// last piece is missing, the ring was full.
+/// last piece is missing, the ring was full, or the bytes could not be read.
 ///
-/// With [`crate::record::flag::STREAM`] the piece is a chunk of a TCP connection instead.
+/// With [`crate::record::flag::STREAM`] the piece is a chunk of a TCP connection, or the head of a
+/// QUIC datagram.
 #[derive(
     Clone, Copy, Default, PartialEq, Eq, Debug, FromBytes, IntoBytes, Immutable, KnownLayout,
 )]

@@ -25,7 +25,7 @@ pub const BUCKETS: usize = 96;
 /// Maximum number of causal publications reported per callback and second.
 pub const HOPS_PER_SECOND: u32 = 128;
 
-/// Durations below this number of nanoseconds share the first bucket.
+/// Durations below 5/4 of this number of nanoseconds share the first bucket.
 const FLOOR: u64 = 1 << FLOOR_BITS;
 const FLOOR_BITS: u32 = 10;
 /// Each power of two is divided into this many buckets.
@@ -127,7 +127,7 @@ pub struct Figures {
     /// Publications to subscriptions in the same process, messages taken from the buffer, calls
     /// for intra-process messages.
     pub within: u64,
-    /// Time of the last event that `count` counts.
+    /// Time of the last event.
     pub last: u64,
     /// Sums by [`distribution`], in nanoseconds.
     pub sums: [u64; 2],
@@ -283,7 +283,7 @@ pub mod announced {
     pub const LATE: u32 = 17;
 }
 
-/// The name or a relation of a handle, sent once for each handle.
+/// The name or a relation of a handle, or a transition of a state machine.
 #[derive(Clone, Copy, Debug, FromBytes, IntoBytes, Immutable, KnownLayout)]
 #[repr(C)]
 pub struct Announcement {
@@ -303,9 +303,9 @@ pub struct Announcement {
     pub parent: u64,
     /// See [`announced`].
     pub value: u64,
-    /// Ends with a zero; empty if it could not be read.
+    /// See [`announced`]. Ends with a zero; empty if the kind has no text.
     pub text: [u8; NAME_BYTES],
-    /// As `text`.
+    /// As `text`; also empty if it could not be read.
     pub second: [u8; NAME_BYTES],
 }
 

@@ -66,9 +66,10 @@ pub mod flag {
     /// A copy of a record with the same time, because the datagram was dropped at the socket's full
     /// buffer. DATA, DATA_FRAG and DATA_BATCH only.
     pub const SOCKET_FULL: u16 = 1 << 7;
-    /// The datagram never became complete: the kernel timed out waiting for IP fragments
-    /// (`net.ipv4.ipfrag_time`, 30 s), or had no memory for them. The record is written then, for
-    /// the submessages in the first fragment. DATA, DATA_FRAG and DATA_BATCH only; `socket` is 0.
+    /// The datagram never became complete: the kernel timed out waiting for IP fragments, or had no
+    /// memory for them. By default it waits 30 s with IPv4 (`net.ipv4.ipfrag_time`) and 60 s with
+    /// IPv6 (`net.ipv6.ip6frag_time`). The record is written then, for the submessages in the first
+    /// fragment. DATA, DATA_FRAG and DATA_BATCH only; `socket` is 0.
     pub const NOT_REASSEMBLED: u16 = 1 << 8;
     /// The message was read from shared memory between processes of this host, which is sampled.
     /// Missing samples may have been sent, unless [`EXACT`] is set.
@@ -77,7 +78,8 @@ pub mod flag {
     /// samples were not sent.
     pub const EXACT: u16 = 1 << 10;
     /// A TCP connection of Zenoh carried the sample: a copy is for another receiver, never a
-    /// repetition. In a [`crate::host::Piece`]: the piece is a chunk of such a connection.
+    /// repetition. In a [`crate::host::Piece`]: the piece is a chunk of a TCP connection, or the
+    /// head of a QUIC datagram.
     pub const STREAM: u16 = 1 << 11;
     /// With [`STREAM`]: the sample was sent to a router, which forwards it and is not a subscriber.
     pub const RELAYED: u16 = 1 << 12;

@@ -187,8 +187,9 @@ macro_rules! read {
 }
 
 /// Reads the submessage at `walk.offset`, given that the first `present` bytes of the payload are
-/// available. Advances the offset unless it returns [`Step::Later`], [`Step::Split`] or
-/// [`Step::End`]. After [`Step::Malformed`] the walk cannot continue.
+/// available. [`Step::Later`], [`Step::Split`] and [`Step::End`] leave the offset unchanged. After
+/// [`Step::Malformed`] the walk cannot continue, and the offset is the datagram's end or unchanged.
+/// Otherwise the offset is that of the next submessage.
 #[inline(always)]
 pub fn step<B: Bytes>(walk: &mut Walk, bytes: &B, present: u32) -> Step {
     let start = walk.offset;

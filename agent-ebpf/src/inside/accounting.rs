@@ -11,7 +11,7 @@ use ros2probe_wire::inside::{
 };
 
 /// Control groups whose throttling is added up: that of the thread, and those around it.
-const LEVELS: u32 = 4;
+const MAX_CGROUP_LEVELS: u32 = 4;
 
 /// Offsets of members by `accounting`. Set by the loader.
 #[unsafe(no_mangle)]
@@ -36,7 +36,7 @@ pub struct Accounting {
 /// # Safety
 /// `to` is in a map value.
 #[inline(always)]
-pub unsafe fn read_into(to: *mut Accounting) -> u64 {
+pub unsafe fn read_accounting(to: *mut Accounting) -> u64 {
     if offset(RUNTIME) == ABSENT
         || offset(RUN_DELAY) == ABSENT
         || offset(VOLUNTARY_SWITCHES) == ABSENT
@@ -47,10 +47,10 @@ pub unsafe fn read_into(to: *mut Accounting) -> u64 {
     unsafe {
         let task = bpf_get_current_task();
         (*to).throttled = throttled(task);
-        let refused = copy_word(task, RUNTIME, &raw mut (*to).cpu)
-            | copy_word(task, RUN_DELAY, &raw mut (*to).runnable)
-            | copy_word(task, VOLUNTARY_SWITCHES, &raw mut (*to).voluntary_switches);
-        u64::from(refused == 0)
+        let error = read_u64_into(task, RUNTIME, &raw mut (*to).cpu)
+            | read_u64_into(task, RUN_DELAY, &raw mut (*to).runnable)
+            | read_u64_into(task, VOLUNTARY_SWITCHES, &raw mut (*to).voluntary_switches);
+        u64::from(error == 0)
     }
 }
 
@@ -70,19 +70,24 @@ pub unsafe fn states(
     // Waiting is exact. A thread without a voluntary switch was never blocked, so it ran for the
     // rest. Otherwise the CPU time may lack a tick, and may have one from before the span. No part
     // can be larger than what the others leave: groups are throttled on several CPUs.
-    let waited = least(after.runnable.wrapping_sub(before.runnable), duration);
+    let run_delay = min(after.runnable.wrapping_sub(before.runnable), duration);
     let cpu = if after.voluntary_switches == before.voluntary_switches {
-        duration - waited
+        duration - run_delay
     } else {
-        least(after.cpu.wrapping_sub(before.cpu), duration - waited)
+        min(after.cpu.wrapping_sub(before.cpu), duration - run_delay)
     };
-    let throttled = least(after.throttled.wrapping_sub(before.throttled), waited);
+    let throttled = min(after.throttled.wrapping_sub(before.throttled), run_delay);
     // In the order of `thread_state`.
-    [cpu, throttled, waited - throttled, duration - cpu - waited]
+    [
+        cpu,
+        throttled,
+        run_delay - throttled,
+        duration - cpu - run_delay,
+    ]
 }
 
 #[inline(always)]
-pub const fn least(one: u64, other: u64) -> u64 {
+pub const fn min(one: u64, other: u64) -> u64 {
     if one < other { one } else { other }
 }
 
@@ -94,13 +99,13 @@ pub fn throttled(task: u64) -> u64 {
         return 0;
     }
     let (mut sum, mut level) = (0_u64, 0);
-    let mut group = word(task, GROUP).unwrap_or(0);
-    while level < LEVELS {
+    let mut group = read_u64(task, GROUP).unwrap_or(0);
+    while level < MAX_CGROUP_LEVELS {
         if group == 0 {
             break;
         }
-        sum = sum.wrapping_add(word(group, GROUP_THROTTLED).unwrap_or(0));
-        group = word(group, GROUP_PARENT).unwrap_or(0);
+        sum = sum.wrapping_add(read_u64(group, GROUP_THROTTLED).unwrap_or(0));
+        group = read_u64(group, GROUP_PARENT).unwrap_or(0);
         level += 1;
     }
     sum
@@ -116,17 +121,17 @@ pub fn offset(of: usize) -> u32 {
 
 /// Reads a member of the structure at `address`.
 #[inline(always)]
-pub fn word(address: u64, of: usize) -> Option<u64> {
+pub fn read_u64(address: u64, of: usize) -> Option<u64> {
     let mut value = MaybeUninit::<u64>::zeroed();
     // SAFETY: the destination has the size of the member.
-    let result = unsafe { copy_word(address, of, value.as_mut_ptr()) };
+    let result = unsafe { read_u64_into(address, of, value.as_mut_ptr()) };
     // SAFETY: any bytes are a number.
     (result == 0).then(|| unsafe { value.assume_init() })
 }
 
 /// Copies a member of the structure at `address`. Returns 0, or an error; `to` is then 0.
 #[inline(always)]
-unsafe fn copy_word(address: u64, of: usize, to: *mut u64) -> i64 {
+unsafe fn read_u64_into(address: u64, of: usize, to: *mut u64) -> i64 {
     let address = address.wrapping_add(u64::from(offset(of)));
     // SAFETY: `to` is writable, by the caller; the kernel checks the address.
     unsafe { bpf_probe_read_kernel(to.cast(), size_of::<u64>() as u32, address as *const _) }

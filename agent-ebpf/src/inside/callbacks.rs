@@ -8,33 +8,37 @@ use ros2probe_wire::inside::{
 
 use crate::{
     accounting,
-    instructions::add,
+    instructions::atomic_add,
     late,
-    maps::{ANNOUNCEMENTS, Current, Thread, calendar, count, now, observe, raw, read},
+    maps::{
+        ANNOUNCEMENTS, CallContext, Thread, count, monotonic_raw_ns, now, read_user, realtime_ns,
+        record_duration,
+    },
     messages, names,
 };
 
 const SECOND: u64 = 1_000_000_000;
 /// Maximum plausible period of a timer, and maximum distance of its last call, in nanoseconds.
-const LONGEST: u64 = 86_400 * SECOND;
-const SHORTEST: u64 = 1_000;
+const MAX_TIMER_PERIOD_NS: u64 = 86_400 * SECOND;
+/// Minimum plausible period of a timer, in nanoseconds.
+const MIN_TIMER_PERIOD_NS: u64 = 1_000;
 /// Difference of clock readings that is treated as zero, in nanoseconds.
-const IMPRECISION: u64 = 10_000_000;
+const CLOCK_TOLERANCE_NS: u64 = 10_000_000;
 /// First and last offset in `rcl_timer_impl_t` at which the period is searched. The times of the
 /// last and the next call follow the period.
-const FIRST_PLACE: u32 = 32;
-const LAST_PLACE: u32 = 80;
+const MIN_PERIOD_OFFSET: u32 = 32;
+const MAX_PERIOD_OFFSET: u32 = 80;
 
 /// Handles the start of the execution of a handle; 0 = the executor selects the next one.
 #[inline(always)]
-pub fn executed(handle: u64) {
-    let Some(current) = Current::of_call() else {
+pub fn on_executor_execute(handle: u64) {
+    let Some(current) = CallContext::count_call() else {
         return;
     };
     if let Some(thread) = current.thread() {
         // SAFETY: a map value pointer checked against null, of the running thread.
         unsafe {
-            (*thread).executed = handle;
+            (*thread).executing_handle = handle;
             if handle != 0 {
                 (*thread).input = current.handle(0, 0);
             }
@@ -44,14 +48,14 @@ pub fn executed(handle: u64) {
 
 /// Handles the start of a callback for a message of the same process.
 #[inline(always)]
-pub fn received(callback: u64) {
-    let Some(current) = Current::of_call() else {
+pub fn count_intra_process_message(callback: u64) {
+    let Some(current) = CallContext::count_call() else {
         return;
     };
     if let Some(figures) = current.figures(callback, kind::CALLBACK) {
         // SAFETY: a map value pointer checked against null.
         unsafe {
-            add(&raw mut (*figures).within, 1);
+            atomic_add(&raw mut (*figures).within, 1);
             (*figures).trigger = current.handle(0, kind::BUFFER);
             write_volatile(&raw mut (*figures).last, now());
         }
@@ -60,8 +64,8 @@ pub fn received(callback: u64) {
 
 /// Handles the start of a callback.
 #[inline(always)]
-pub fn started(callback: u64, within: bool) {
-    let Some(current) = Current::of_call() else {
+pub fn on_callback_start(callback: u64, within: bool) {
+    let Some(current) = CallContext::count_call() else {
         return;
     };
     let (Some(figures), Some(thread)) =
@@ -75,26 +79,27 @@ pub fn started(callback: u64, within: bool) {
         (*thread).callback = callback;
         (*thread).started = now;
         (*figures).thread = current.thread;
-        (*thread).is_accounted = accounting::read_into(&raw mut (*thread).accounting);
+        (*thread).has_accounting =
+            accounting::read_accounting(&raw mut (*thread).accounting_at_start);
         let input = (*thread).input;
         let mut delay = 0;
         if within {
-            add(&raw mut (*figures).within, 1);
+            atomic_add(&raw mut (*figures).within, 1);
             if input.kind == kind::BUFFER {
                 (*figures).trigger = input;
-                let entered = (*thread).entered;
+                let entered = (*thread).enqueued_ns;
                 if entered != 0 && now > entered {
                     delay = now - entered;
-                    observe(figures, distribution::DELAY, delay);
+                    record_duration(figures, distribution::DELAY, delay);
                 }
             } else {
                 (*figures).trigger = current.handle(0, kind::BUFFER);
             }
         } else if input.kind == kind::SUBSCRIPTION {
             (*figures).trigger = input;
-            delay = waited_since_source(&current, figures, thread, now);
-        } else if (*thread).executed != 0 {
-            let executed = (*thread).executed;
+            delay = record_wait_since_publication(&current, figures, thread, now);
+        } else if (*thread).executing_handle != 0 {
+            let executed = (*thread).executing_handle;
             // The schedule of a known timer was read before.
             let is_timer = (*figures).period != 0;
             let rmw = if is_timer {
@@ -104,24 +109,24 @@ pub fn started(callback: u64, within: bool) {
             };
             if rmw == 0 {
                 (*figures).trigger = current.handle(executed, kind::TIMER);
-                delay = waited_since_due(&current, figures, executed, now);
+                delay = record_timer_delay(&current, figures, executed, now);
             } else {
                 // `rmw_fastrtps_cpp` takes messages of buffer topics without `rmw_take`.
                 (*figures).trigger = current.handle(rmw, kind::SUBSCRIPTION);
-                messages::taken_unseen(&current, rmw, now);
+                messages::count_untraced_take(&current, rmw, now);
             }
         } else {
             (*figures).trigger = current.handle(0, 0);
         }
-        late::began(&current, delay, now, thread);
+        late::on_call_start(&current, delay, now, thread);
     }
 }
 
 /// Adds the time since the message's source timestamp, less the minimum delay of the subscription's
 /// takes. Returns that time; 0 if it is unknown.
 #[inline(always)]
-unsafe fn waited_since_source(
-    current: &Current,
+unsafe fn record_wait_since_publication(
+    current: &CallContext,
     figures: *mut Figures,
     thread: *const Thread,
     now: u64,
@@ -129,76 +134,81 @@ unsafe fn waited_since_source(
     // SAFETY: map values, by the caller.
     unsafe {
         let source = (*thread).source_timestamp;
-        let calendar = calendar(now);
+        let calendar = realtime_ns(now);
         if source == 0 || calendar <= source {
             return 0;
         }
         let input = (*thread).input;
-        let Some(subscription) = current.known_figures(input.address, kind::SUBSCRIPTION) else {
+        let Some(subscription) = current.existing_figures(input.address, kind::SUBSCRIPTION) else {
             return 0;
         };
         let minima = (&raw const (*subscription).minima).cast::<u64>();
-        let least = read_volatile(minima.add(distribution::DELAY));
+        let minimum_plus_one = read_volatile(minima.add(distribution::DELAY));
         let delay = calendar - source;
-        if least == 0 || delay < least - 1 {
+        if minimum_plus_one == 0 || delay < minimum_plus_one - 1 {
             return 0;
         }
-        observe(figures, distribution::DELAY, delay - (least - 1));
-        delay - (least - 1)
+        record_duration(figures, distribution::DELAY, delay - (minimum_plus_one - 1));
+        delay - (minimum_plus_one - 1)
     }
 }
 
 /// Adds the time since the timer was due. The timer's structure already has the time of the next
 /// call. Returns that time; 0 if it is unknown.
 #[inline(always)]
-unsafe fn waited_since_due(current: &Current, figures: *mut Figures, timer: u64, now: u64) -> u64 {
-    let structure = read::<u64>(timer);
-    let place = match current.timer_period_at() {
-        0 => find_period(structure, now),
-        place => place,
+unsafe fn record_timer_delay(
+    current: &CallContext,
+    figures: *mut Figures,
+    timer: u64,
+    now: u64,
+) -> u64 {
+    let structure = read_user::<u64>(timer);
+    let offset = match current.timer_period_offset() {
+        0 => find_period_offset(structure, now),
+        offset => offset,
     };
-    if place == 0 {
+    if offset == 0 {
         return 0;
     }
-    let [period, last, next] = read::<[u64; 3]>(structure + u64::from(place));
-    if !is_schedule(period, last, next, now) {
+    let [period, last, next] = read_user::<[u64; 3]>(structure + u64::from(offset));
+    if !is_timer_schedule(period, last, next, now) {
         return 0;
     }
-    current.found_timer_period(place);
+    current.set_timer_period_offset(offset);
     // SAFETY: a map value, by the caller.
     unsafe {
         // The executor moves the next call by whole periods. Otherwise the timer was reset.
         let expected = (*figures).due;
         let (mut due, mut skipped) = (next - period, 0);
-        let ahead = next.wrapping_sub(expected);
-        if expected != 0 && next > expected && ahead.checked_rem(period) == Some(0) {
+        let advance_ns = next.wrapping_sub(expected);
+        if expected != 0 && next > expected && advance_ns.checked_rem(period) == Some(0) {
             due = expected;
-            skipped = ahead.checked_div(period).unwrap_or(1) - 1;
+            skipped = advance_ns.checked_div(period).unwrap_or(1) - 1;
         }
         (*figures).due = next;
         (*figures).period = period;
         if skipped != 0 {
-            add(&raw mut (*figures).failed, skipped);
+            atomic_add(&raw mut (*figures).failed, skipped);
         }
-        let clock = clock_of(last, now);
+        let clock = timer_clock_now(last, now);
         if clock <= due {
             return 0;
         }
-        observe(figures, distribution::DELAY, clock - due);
+        record_duration(figures, distribution::DELAY, clock - due);
         clock - due
     }
 }
 
 /// Finds the offset of the period; 0 if no offset has a plausible one.
 #[inline(always)]
-fn find_period(structure: u64, now: u64) -> u32 {
-    let mut place = FIRST_PLACE;
-    while place <= LAST_PLACE {
-        let [period, last, next] = read::<[u64; 3]>(structure + u64::from(place));
-        if is_schedule(period, last, next, now) {
-            return place;
+fn find_period_offset(structure: u64, now: u64) -> u32 {
+    let mut offset = MIN_PERIOD_OFFSET;
+    while offset <= MAX_PERIOD_OFFSET {
+        let [period, last, next] = read_user::<[u64; 3]>(structure + u64::from(offset));
+        if is_timer_schedule(period, last, next, now) {
+            return offset;
         }
-        place += 8;
+        offset += 8;
     }
     0
 }
@@ -206,28 +216,31 @@ fn find_period(structure: u64, now: u64) -> u32 {
 /// Returns whether three numbers can be a period, the time of a call within the last second, and
 /// the time of the next call.
 #[inline(always)]
-fn is_schedule(period: u64, last: u64, next: u64, now: u64) -> bool {
-    let is_period = period >= SHORTEST && period <= LONGEST && next > last && next - last <= period;
-    is_period && clock_of(last, now).wrapping_sub(last) < SECOND
+fn is_timer_schedule(period: u64, last: u64, next: u64, now: u64) -> bool {
+    let is_period = period >= MIN_TIMER_PERIOD_NS
+        && period <= MAX_TIMER_PERIOD_NS
+        && next > last
+        && next - last <= period;
+    is_period && timer_clock_now(last, now).wrapping_sub(last) < SECOND
 }
 
 /// Returns the current time of the clock from which `last` was read: the system's, or rcl's steady
-/// clock, CLOCK_MONOTONIC_RAW in Humble and CLOCK_MONOTONIC in Jazzy. Of these two, it is the one that
-/// passed `last` later. A result slightly before `last` becomes `last`, because the clock differences
-/// that user space sets are imprecise.
+/// clock, CLOCK_MONOTONIC_RAW in Humble and CLOCK_MONOTONIC in Jazzy. Of these two, it is the one
+/// that passed `last` later. A result slightly before `last` becomes `last`, because the clock
+/// differences that user space sets are imprecise.
 #[inline(always)]
-fn clock_of(last: u64, now: u64) -> u64 {
-    let raw = raw(now);
+fn timer_clock_now(last: u64, now: u64) -> u64 {
+    let raw = monotonic_raw_ns(now);
     // A clock before `last` has the greatest age.
-    let age = |clock: u64| clock.wrapping_add(IMPRECISION).wrapping_sub(last);
-    let clock = if last >= now.wrapping_add(LONGEST) {
-        calendar(now)
+    let age = |clock: u64| clock.wrapping_add(CLOCK_TOLERANCE_NS).wrapping_sub(last);
+    let clock = if last >= now.wrapping_add(MAX_TIMER_PERIOD_NS) {
+        realtime_ns(now)
     } else if age(raw) < age(now) {
         raw
     } else {
         now
     };
-    if clock < last && last - clock < IMPRECISION {
+    if clock < last && last - clock < CLOCK_TOLERANCE_NS {
         last
     } else {
         clock
@@ -236,52 +249,53 @@ fn clock_of(last: u64, now: u64) -> u64 {
 
 /// Handles the end of a callback.
 #[inline(always)]
-pub fn ended(callback: u64) {
-    let Some(current) = Current::of_call() else {
+pub fn on_callback_end(callback: u64) {
+    let Some(current) = CallContext::count_call() else {
         return;
     };
     let (Some(figures), Some(thread)) = (
         current.figures(callback, kind::CALLBACK),
-        current.known_thread(),
+        current.existing_thread(),
     ) else {
         return;
     };
     let now = now();
-    // SAFETY: as in `started`.
+    // SAFETY: as in `on_callback_start`.
     unsafe {
-        add(&raw mut (*figures).count, 1);
+        atomic_add(&raw mut (*figures).count, 1);
         write_volatile(&raw mut (*figures).last, now);
         // A callback that runs an executor contains other callbacks, which overwrite its start.
         if (*thread).callback == callback && now > (*thread).started {
             let duration = now - (*thread).started;
-            observe(figures, distribution::INTERVAL, duration);
-            (*thread).is_accounted &= accounting::read_into(&raw mut (*thread).after);
+            record_duration(figures, distribution::INTERVAL, duration);
+            (*thread).has_accounting &=
+                accounting::read_accounting(&raw mut (*thread).accounting_at_end);
             (*thread).states = [0; thread_state::COUNT];
-            if (*thread).is_accounted != 0 {
-                let before = &raw const (*thread).accounting;
-                let states = accounting::states(before, &(*thread).after, duration);
+            if (*thread).has_accounting != 0 {
+                let before = &raw const (*thread).accounting_at_start;
+                let states = accounting::states(before, &(*thread).accounting_at_end, duration);
                 let sums = (&raw mut (*figures).states).cast::<u64>();
                 let mut state = 0;
                 while state < states.len() {
-                    add(sums.add(state), states[state]);
+                    atomic_add(sums.add(state), states[state]);
                     state += 1;
                 }
-                add(&raw mut (*figures).states_known, 1);
+                atomic_add(&raw mut (*figures).states_known, 1);
                 (*thread).states = states;
             }
             let trigger = (*figures).trigger;
-            late::ended(&current, callback, trigger, thread, now);
+            late::on_call_end(&current, callback, trigger, thread, now);
         }
         (*thread).callback = 0;
-        (*thread).executed = 0;
+        (*thread).executing_handle = 0;
         (*thread).input = current.handle(0, 0);
     }
 }
 
 /// Reports a publication during a callback that handles a message.
 #[inline(always)]
-pub fn published(current: &Current, publisher: u64, within: bool, now: u64) {
-    let Some(thread) = current.known_thread() else {
+pub fn published(current: &CallContext, publisher: u64, within: bool, now: u64) {
+    let Some(thread) = current.existing_thread() else {
         return;
     };
     // SAFETY: a map value pointer checked against null, of the running thread.
@@ -289,7 +303,7 @@ pub fn published(current: &Current, publisher: u64, within: bool, now: u64) {
     if callback == 0 || input.address == 0 {
         return;
     }
-    let Some(figures) = current.known_figures(callback, kind::CALLBACK) else {
+    let Some(figures) = current.existing_figures(callback, kind::CALLBACK) else {
         return;
     };
     // SAFETY: as above.
@@ -305,12 +319,12 @@ pub fn published(current: &Current, publisher: u64, within: bool, now: u64) {
         (*figures).hops += 1;
     }
     // SAFETY: as above.
-    unsafe { report(current, thread, publisher, within, input, now) };
+    unsafe { send_hop(current, thread, publisher, within, input, now) };
 }
 
 #[inline(always)]
-unsafe fn report(
-    current: &Current,
+unsafe fn send_hop(
+    current: &CallContext,
     thread: *const Thread,
     publisher: u64,
     within: bool,

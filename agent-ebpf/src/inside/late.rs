@@ -18,15 +18,16 @@ use ros2probe_wire::inside::{
 
 use crate::{
     accounting::{self, Accounting},
-    instructions::{add, opaque},
-    maps::{ANNOUNCEMENTS, Current, Thread, count},
+    instructions::{atomic_add, hide_bounds},
+    maps::{ANNOUNCEMENTS, CallContext, Thread, count},
 };
 
 const SECOND: u64 = 1_000_000_000;
-/// Minimum time for which a thread that waits for work is blocked between two calls, in nanoseconds.
-const IDLE: u64 = 100_000;
+/// Minimum time for which a thread that waits for work is blocked between two calls, in
+/// nanoseconds.
+const MIN_IDLE_NS: u64 = 100_000;
 /// Numbers of 64 bits in [`FOLLOWED`].
-const WORDS: u32 = THREAD_IDS / 64;
+const BITMAP_WORDS: u32 = THREAD_IDS / 64;
 
 /// One of [`mode`]. Set by user space.
 #[map]
@@ -43,7 +44,7 @@ static FOLLOWED_THREADS: LruHashMap<u32, Followed> =
 static NEW_FOLLOWED: Array<Followed> = Array::with_max_entries(1, 0);
 /// One bit for each thread id: the thread is followed.
 #[map]
-static FOLLOWED: Array<u64> = Array::with_max_entries(WORDS, 0);
+static FOLLOWED: Array<u64> = Array::with_max_entries(BITMAP_WORDS, 0);
 /// Number of followed threads that can run and do not.
 #[map]
 static RUNNABLE_THREADS: Array<i64> = Array::with_max_entries(1, 0);
@@ -74,11 +75,11 @@ pub struct Followed {
     /// One of [`state`].
     pub state: u64,
     /// Start of that state, or of the present span if that is later.
-    pub since: u64,
+    pub state_since_ns: u64,
     /// Time at which the thread began to run; 0 = unknown.
-    pub entered: u64,
+    pub on_cpu_since_ns: u64,
     /// The scheduler's CPU time of the thread at its last switch.
-    pub charged: u64,
+    pub sum_exec_runtime_ns: u64,
     /// The scheduler's waiting time of the thread when it last left a CPU.
     pub run_delay: u64,
     /// Its process.
@@ -86,12 +87,12 @@ pub struct Followed {
     /// One of [`role`].
     pub role: u64,
     /// The present wait, if the thread is blocked.
-    pub wait: Blocked,
+    pub current_wait: Blocked,
     /// Of an executor's thread, how a thread of its process woke it after its wait for work. Of a
     /// receiver, how it was itself woken for a message.
     pub handoff: Handoff,
     /// That wait.
-    pub handoff_wait: u64,
+    pub wait_before_handoff_ns: u64,
     /// The last call of another thread at whose end that thread woke this one, since the last call
     /// of this one.
     pub released_by: Call,
@@ -100,29 +101,29 @@ pub struct Followed {
     /// What the thread did since the last start or end of a callback.
     pub activity: Activity,
     /// The last time in which the thread was stopped, and its end; 0 = never.
-    pub stop: Blocked,
-    pub stop_ended: u64,
+    pub last_stop: Blocked,
+    pub last_stop_end_ns: u64,
     /// What it did between the call before and the present one.
-    before: Activity,
+    activity_before: Activity,
     /// The mode when the present call began.
-    mode: u64,
+    mode_at_start: u64,
     /// Time from ready to start of the present call.
-    delay: u64,
+    start_delay_ns: u64,
     /// Accounting at the last start or end of a callback.
     accounting: Accounting,
     is_accounted: u64,
     states_before: [u64; thread_state::COUNT],
     is_accounted_before: u64,
     /// The call that ends.
-    present: Call,
+    current_call: Call,
     /// The call before.
-    pub previous: Call,
+    pub previous_call: Call,
     /// Time at which it was last woken.
-    pub woken: u64,
+    pub last_wakeup_ns: u64,
     /// Since when it makes one call after the other: it was woken for the first one.
-    busy_since: u64,
+    busy_since_ns: u64,
     /// Time in calls since then.
-    in_calls: u64,
+    busy_call_ns: u64,
     /// Time between these calls, for which it could run and did not, and was throttled.
     busy_runnable: u64,
     busy_throttled: u64,
@@ -132,7 +133,7 @@ pub struct Followed {
 
 /// Returns the present mode.
 #[inline(always)]
-pub fn present_mode() -> u32 {
+pub fn current_mode() -> u32 {
     match LATE_MODE.get_ptr(0) {
         // SAFETY: a map value pointer checked against null.
         Some(mode) => unsafe { read_volatile(mode) },
@@ -200,16 +201,16 @@ pub fn is_any_runnable() -> bool {
 #[inline(always)]
 pub fn add_runnable(by: i64) {
     if let Some(count) = RUNNABLE_THREADS.get_ptr_mut(0) {
-        add(count.cast(), by as u64);
+        atomic_add(count.cast(), by as u64);
     }
 }
 
 /// Begins a new span of time of the running thread.
 #[inline(always)]
-unsafe fn begin_span(followed: *mut Followed, now: u64) {
+unsafe fn start_interval(followed: *mut Followed, now: u64) {
     // SAFETY: a map value, by the caller.
     unsafe {
-        let since = (*followed).since;
+        let since = (*followed).state_since_ns;
         if (*followed).state == state::RUNNING {
             if since != 0 && now > since {
                 (*followed).activity.cpu += now - since;
@@ -222,7 +223,7 @@ unsafe fn begin_span(followed: *mut Followed, now: u64) {
             (*followed).state = state::RUNNING;
             (*followed).activity.missed += 1;
         }
-        (*followed).since = now;
+        (*followed).state_since_ns = now;
     }
 }
 
@@ -235,7 +236,7 @@ pub unsafe fn copy<T: Copy>(from: *const T, to: *mut T) {
 
 /// Empties what a thread did.
 #[inline(always)]
-pub unsafe fn clear(followed: *mut Followed) {
+pub unsafe fn reset_activity(followed: *mut Followed) {
     if let Some(new) = NEW_FOLLOWED.get_ptr(0) {
         // SAFETY: map values checked against null.
         unsafe { copy(&raw const (*new).activity, &raw mut (*followed).activity) };
@@ -244,27 +245,27 @@ pub unsafe fn clear(followed: *mut Followed) {
 
 /// Forgets what an earlier thread of the same id did.
 #[inline(always)]
-unsafe fn restart(followed: *mut Followed) {
+unsafe fn reset_thread(followed: *mut Followed) {
     // SAFETY: a map value, by the caller.
     unsafe {
-        clear(followed);
+        reset_activity(followed);
         (*followed).state = state::RUNNING;
-        (*followed).since = 0;
-        (*followed).entered = 0;
+        (*followed).state_since_ns = 0;
+        (*followed).on_cpu_since_ns = 0;
         (*followed).role = role::NONE;
         (*followed).handoff.at = 0;
-        (*followed).handoff_wait = 0;
+        (*followed).wait_before_handoff_ns = 0;
         (*followed).released_by.ended = 0;
-        (*followed).stop_ended = 0;
+        (*followed).last_stop_end_ns = 0;
         (*followed).is_accounted = 0;
-        (*followed).previous.ended = 0;
+        (*followed).previous_call.ended = 0;
     }
 }
 
 /// Handles the start of a callback.
 #[inline(always)]
-pub fn began(current: &Current, delay: u64, now: u64, thread: *const Thread) {
-    if present_mode() == mode::OFF {
+pub fn on_call_start(current: &CallContext, delay: u64, now: u64, thread: *const Thread) {
+    if current_mode() == mode::OFF {
         return;
     }
     let Some(followed) = follow(current.thread) else {
@@ -275,35 +276,38 @@ pub fn began(current: &Current, delay: u64, now: u64, thread: *const Thread) {
         let process = read_volatile(&raw const (*followed).process);
         if process != 0 && process != u64::from(current.process) {
             // Another thread had the id, and its end was not observed.
-            restart(followed);
+            reset_thread(followed);
         }
-        begin_span(followed, now);
-        copy(&raw const (*followed).activity, &raw mut (*followed).before);
-        clear(followed);
+        start_interval(followed, now);
+        copy(
+            &raw const (*followed).activity,
+            &raw mut (*followed).activity_before,
+        );
+        reset_activity(followed);
         (*followed).process = u64::from(current.process);
         if (*followed).role == role::RECEIVER {
             // That was how it was woken itself.
             (*followed).handoff.at = 0;
         }
         (*followed).role = role::IN_CALLBACK;
-        (*followed).delay = delay;
+        (*followed).start_delay_ns = delay;
         (*followed).is_accounted_before = 0;
         (*followed).states_before = [0; thread_state::COUNT];
-        let previous_ended = (*followed).previous.ended;
-        let is_accounted = (*thread).is_accounted & (*followed).is_accounted;
+        let previous_ended = (*followed).previous_call.ended;
+        let is_accounted = (*thread).has_accounting & (*followed).is_accounted;
         if is_accounted != 0 && previous_ended != 0 && now > previous_ended {
             (*followed).states_before = accounting::states(
                 &raw const (*followed).accounting,
-                &(*thread).accounting,
+                &(*thread).accounting_at_start,
                 now - previous_ended,
             );
             (*followed).is_accounted_before = 1;
         }
-        if has_waited(followed) {
-            let woken = read_volatile(&raw const (*followed).woken);
-            let is_later = woken > read_volatile(&raw const (*followed).previous.ended);
-            (*followed).busy_since = if is_later { woken } else { now };
-            (*followed).in_calls = 0;
+        if was_idle(followed) {
+            let woken = read_volatile(&raw const (*followed).last_wakeup_ns);
+            let is_later = woken > read_volatile(&raw const (*followed).previous_call.ended);
+            (*followed).busy_since_ns = if is_later { woken } else { now };
+            (*followed).busy_call_ns = 0;
             (*followed).busy_runnable = 0;
             (*followed).busy_throttled = 0;
             (*followed).longest_call.ended = 0;
@@ -311,28 +315,33 @@ pub fn began(current: &Current, delay: u64, now: u64, thread: *const Thread) {
         }
         // Of a wait for a CPU before the thread was woken, no part is longer than the busy time.
         let states = (&raw const (*followed).states_before).cast::<u64>();
-        let busy = now - read_volatile(&raw const (*followed).busy_since);
+        let busy = now - read_volatile(&raw const (*followed).busy_since_ns);
         let runnable = read_volatile(states.add(thread_state::RUNNABLE));
         let throttled = read_volatile(states.add(thread_state::THROTTLED));
-        (*followed).busy_runnable += accounting::least(runnable, busy);
-        (*followed).busy_throttled += accounting::least(throttled, busy);
-        (*followed).mode = u64::from(present_mode());
+        (*followed).busy_runnable += accounting::min(runnable, busy);
+        (*followed).busy_throttled += accounting::min(throttled, busy);
+        (*followed).mode_at_start = u64::from(current_mode());
     }
 }
 
 /// Returns whether a thread waited for work before the call that begins.
 #[inline(always)]
-unsafe fn has_waited(followed: *const Followed) -> bool {
+unsafe fn was_idle(followed: *const Followed) -> bool {
     // SAFETY: a map value, by the caller.
     unsafe {
-        if read_volatile(&raw const (*followed).previous.ended) == 0 {
+        if read_volatile(&raw const (*followed).previous_call.ended) == 0 {
             return true;
         }
         // The mode is that of the call before.
-        let had_events = read_volatile(&raw const (*followed).mode) == u64::from(mode::EVENTS);
-        if had_events && present_mode() == mode::EVENTS && (*followed).before.missed == 0 {
-            let [lock, sleep, disk, page_fault, stopped, other] = (*followed).before.blocked;
-            if lock + sleep + disk + page_fault + stopped + other <= IDLE {
+        let had_scheduler_events =
+            read_volatile(&raw const (*followed).mode_at_start) == u64::from(mode::EVENTS);
+        if had_scheduler_events
+            && current_mode() == mode::EVENTS
+            && (*followed).activity_before.missed == 0
+        {
+            let [lock, sleep, disk, page_fault, stopped, other] =
+                (*followed).activity_before.blocked;
+            if lock + sleep + disk + page_fault + stopped + other <= MIN_IDLE_NS {
                 return false;
             }
         }
@@ -340,14 +349,20 @@ unsafe fn has_waited(followed: *const Followed) -> bool {
             return true;
         }
         let blocked = (&raw const (*followed).states_before).cast::<u64>();
-        read_volatile(blocked.add(thread_state::BLOCKED)) > IDLE
+        read_volatile(blocked.add(thread_state::BLOCKED)) > MIN_IDLE_NS
     }
 }
 
 /// Handles the end of a callback that began at the thread's `started`.
 #[inline(always)]
-pub fn ended(current: &Current, callback: u64, trigger: Handle, thread: *const Thread, now: u64) {
-    let mode = present_mode();
+pub fn on_call_end(
+    current: &CallContext,
+    callback: u64,
+    trigger: Handle,
+    thread: *const Thread,
+    now: u64,
+) {
+    let mode = current_mode();
     if mode == mode::OFF {
         return;
     }
@@ -356,42 +371,45 @@ pub fn ended(current: &Current, callback: u64, trigger: Handle, thread: *const T
     };
     // SAFETY: map value pointers checked against null, of the running thread.
     unsafe {
-        begin_span(followed, now);
+        start_interval(followed, now);
         let started = (*thread).started;
         // What is needed after the report is stored before it: the verifier of Linux 6.18 fails at
         // numbers that stay on the stack.
-        (*followed).present.callback = callback;
-        (*followed).present.started = started;
-        (*followed).present.ended = now;
-        (*followed).is_accounted = (*thread).is_accounted;
-        copy(&raw const (*thread).after, &raw mut (*followed).accounting);
+        (*followed).current_call.callback = callback;
+        (*followed).current_call.started = started;
+        (*followed).current_call.ended = now;
+        (*followed).is_accounted = (*thread).has_accounting;
+        copy(
+            &raw const (*thread).accounting_at_end,
+            &raw mut (*followed).accounting,
+        );
         let key = current.handle(callback, kind::CALLBACK);
         if let Some(bound) = BOUNDS.get_ptr_mut(&key)
-            && (now - started > (*bound).duration || (*followed).delay > (*bound).delay)
-            && may_report(bound, now)
+            && (now - started > (*bound).duration || (*followed).start_delay_ns > (*bound).delay)
+            && take_report_quota(bound, now)
         {
             let bounds = [(*bound).duration, (*bound).delay];
-            report(
+            send_late_call(
                 current, callback, trigger, thread, followed, now, mode, bounds,
             );
         }
-        clear(followed);
+        reset_activity(followed);
         (*followed).role = role::EXECUTOR;
         (*followed).handoff.at = 0;
-        (*followed).handoff_wait = 0;
+        (*followed).wait_before_handoff_ns = 0;
         (*followed).released_by.ended = 0;
-        let present = &raw const (*followed).present;
-        copy(present, &raw mut (*followed).previous);
-        (*followed).in_calls += duration(present);
+        let present = &raw const (*followed).current_call;
+        copy(present, &raw mut (*followed).previous_call);
+        (*followed).busy_call_ns += duration(present);
         let longest = &raw mut (*followed).longest_call;
         let is_old = now - read_volatile(&raw const (*longest).ended) > SECOND;
         if is_old || duration(present) > duration(longest) {
             copy(present, longest);
         }
         // Of a thread that never waits, the last seconds count.
-        if now - read_volatile(&raw const (*followed).busy_since) > 8 * SECOND {
-            (*followed).busy_since += (now - (*followed).busy_since) / 2;
-            (*followed).in_calls /= 2;
+        if now - read_volatile(&raw const (*followed).busy_since_ns) > 8 * SECOND {
+            (*followed).busy_since_ns += (now - (*followed).busy_since_ns) / 2;
+            (*followed).busy_call_ns /= 2;
             (*followed).busy_runnable /= 2;
             (*followed).busy_throttled /= 2;
         }
@@ -407,7 +425,7 @@ unsafe fn duration(call: *const Call) -> u64 {
 
 /// Counts a report; returns `false` beyond the number of a second.
 #[inline(always)]
-unsafe fn may_report(bound: *mut Bound, now: u64) -> bool {
+unsafe fn take_report_quota(bound: *mut Bound, now: u64) -> bool {
     // SAFETY: a map value, by the caller.
     unsafe {
         if now.wrapping_sub((*bound).since) >= SECOND {
@@ -425,8 +443,8 @@ unsafe fn may_report(bound: *mut Bound, now: u64) -> bool {
 
 #[inline(always)]
 #[expect(clippy::too_many_arguments, reason = "each is a part of the report")]
-unsafe fn report(
-    current: &Current,
+unsafe fn send_late_call(
+    current: &CallContext,
     callback: u64,
     trigger: Handle,
     thread: *const Thread,
@@ -442,31 +460,38 @@ unsafe fn report(
     let late: *mut LateCall = entry.as_mut_ptr();
     // SAFETY: reserved memory of this size, all of which is written; map values, by the caller.
     unsafe {
-        let began_as = (*followed).mode as u32;
-        let is_accounted = (*thread).is_accounted as u32;
+        let mode_at_start = (*followed).mode_at_start as u32;
+        let is_accounted = (*thread).has_accounting as u32;
         let is_accounted_before = (*followed).is_accounted_before as u32;
         (*late).kind = announced::LATE;
         (*late).process = current.process;
         (*late).thread = current.thread;
-        (*late).mode = if began_as < mode { began_as } else { mode };
+        (*late).mode = if mode_at_start < mode {
+            mode_at_start
+        } else {
+            mode
+        };
         (*late).cpu = bpf_get_smp_processor_id();
-        (*late).accounted =
-            (opaque(is_accounted) as u32 & 1) | (opaque(is_accounted_before) as u32 & 1) << 1;
+        (*late).accounted = (hide_bounds(is_accounted) as u32 & 1)
+            | (hide_bounds(is_accounted_before) as u32 & 1) << 1;
         (*late).callback = callback;
         (*late).trigger = trigger;
         (*late).source_timestamp = (*thread).source_timestamp;
         (*late).taken = (*thread).taken;
         (*late).started = (*thread).started;
         (*late).ended = now;
-        (*late).delay = (*followed).delay;
+        (*late).delay = (*followed).start_delay_ns;
         (*late).bounds = bounds;
-        copy(&raw const (*followed).previous, &raw mut (*late).previous);
+        copy(
+            &raw const (*followed).previous_call,
+            &raw mut (*late).previous,
+        );
         copy(
             &raw const (*followed).released_by,
             &raw mut (*late).released_by,
         );
-        (*late).busy_since = (*followed).busy_since;
-        (*late).in_calls = (*followed).in_calls;
+        (*late).busy_since = (*followed).busy_since_ns;
+        (*late).in_calls = (*followed).busy_call_ns;
         (*late).busy_runnable = (*followed).busy_runnable;
         (*late).busy_throttled = (*followed).busy_throttled;
         copy(
@@ -476,10 +501,13 @@ unsafe fn report(
         (*late).states = (*thread).states;
         (*late).states_before = (*followed).states_before;
         copy(&raw const (*followed).handoff, &raw mut (*late).handoff);
-        (*late).stop = (*followed).stop;
-        (*late).stop_ended = (*followed).stop_ended;
+        (*late).stop = (*followed).last_stop;
+        (*late).stop_ended = (*followed).last_stop_end_ns;
         copy(&raw const (*followed).activity, &raw mut (*late).during);
-        copy(&raw const (*followed).before, &raw mut (*late).before);
+        copy(
+            &raw const (*followed).activity_before,
+            &raw mut (*late).before,
+        );
     }
     entry.submit(0);
 }

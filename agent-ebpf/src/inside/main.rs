@@ -3,7 +3,8 @@
 //! `rcl`, `rclcpp` and the middlewares call a function of this library for each event, whether a
 //! tracer is installed or not. A uprobe at the entry of that function runs in the calling process.
 //! The programs read arguments and, once for each handle, names; they write only their own maps. No
-//! data leaves the kernel for each message, except a bounded number of causal publications.
+//! data leaves the kernel for each message, except bounded numbers of causal publications and late
+//! calls.
 //!
 //! The programs use only what the verifier of Linux 5.10 accepts, as the packet filter does.
 
@@ -93,14 +94,14 @@ pub fn called(context: ProbeContext) -> u32 {
 /// Runs whenever a CPU changes from one thread to another.
 #[raw_tracepoint]
 pub fn sched_switch(context: RawTracePointContext) -> u32 {
-    scheduler::switched(&context);
+    scheduler::on_sched_switch(&context);
     0
 }
 
 /// Runs whenever a thread is woken.
 #[raw_tracepoint]
 pub fn sched_waking(context: RawTracePointContext) -> u32 {
-    scheduler::woken(&context);
+    scheduler::on_sched_waking(&context);
     0
 }
 
@@ -126,20 +127,20 @@ calls! {
 
     /// `(callback, bool intra_process)`.
     callback_start(callback, intra_process) {
-        callbacks::started(callback, intra_process as u8 != 0);
+        callbacks::on_callback_start(callback, intra_process as u8 != 0);
     }
     /// As `callback_start`, if only received messages are counted.
     callback_received(callback, intra_process) {
         if intra_process as u8 != 0 {
-            callbacks::received(callback);
+            callbacks::count_intra_process_message(callback);
         }
     }
     /// `(callback)`.
-    callback_end(callback) { callbacks::ended(callback); }
+    callback_end(callback) { callbacks::on_callback_end(callback); }
     /// `(rcl_timer_t * or rcl_subscription_t *)`.
-    rclcpp_executor_execute(handle) { callbacks::executed(handle); }
+    rclcpp_executor_execute(handle) { callbacks::on_executor_execute(handle); }
     /// `()`.
-    rclcpp_executor_get_next_ready() { callbacks::executed(0); }
+    rclcpp_executor_get_next_ready() { callbacks::on_executor_execute(0); }
 
     /// `(rcl_node_t *, rmw_node_t *, name, namespace)`.
     rcl_node_init(node, _rmw, name, namespace) {

@@ -14,12 +14,12 @@ use ros2probe_wire::inside::{
 
 use crate::{
     accounting::Accounting,
-    instructions::{add, opaque},
-    settings::is_within,
+    instructions::{atomic_add, hide_bounds},
+    settings::is_in_target_cgroup,
 };
 
 /// `BPF_NOEXIST`: the first of two threads with a new handle creates its figures.
-const CREATE: u64 = 1;
+const BPF_NOEXIST: u64 = 1;
 
 /// Whether callbacks are observed. Set by the loader.
 #[unsafe(no_mangle)]
@@ -43,7 +43,7 @@ static NEW_THREAD: Array<Thread> = Array::with_max_entries(1, 0);
 /// Times at which messages entered ring buffers.
 #[map]
 pub static WAITING: LruHashMap<Entry, u64> = LruHashMap::with_max_entries(WAITING_CAPACITY, 0);
-/// Names and relations of handles, and causal publications.
+/// Names and relations of handles, causal publications and late calls.
 #[map]
 pub static ANNOUNCEMENTS: RingBuf = RingBuf::with_byte_size(512 * 1024, 0);
 /// Differences of other clocks to CLOCK_MONOTONIC in nanoseconds, by `inside::clock`. Set by user
@@ -60,7 +60,7 @@ static INSIDE_COUNTERS: PerCpuArray<[u64; Counter::ALL.len()]> =
 #[derive(Clone, Copy)]
 pub struct Thread {
     /// Handle that the executor executes; 0 = none.
-    pub executed: u64,
+    pub executing_handle: u64,
     /// Subscription or buffer from which the thread took a message last; kind 0 = none.
     pub input: Handle,
     /// Source timestamp of the message taken, nanoseconds since the Unix epoch.
@@ -68,19 +68,19 @@ pub struct Thread {
     /// Time at which the message was taken.
     pub taken: u64,
     /// Time at which the message entered the ring buffer.
-    pub entered: u64,
+    pub enqueued_ns: u64,
     /// The running callback; 0 = none.
     pub callback: u64,
     /// Time at which the callback began.
     pub started: u64,
     /// Publisher whose message was passed within the process and may also go to the middleware.
-    pub publisher: u64,
+    pub intra_process_publisher: u64,
     /// Whether the accounting of the thread was read when the callback began.
-    pub is_accounted: u64,
+    pub has_accounting: u64,
     /// The accounting at that time.
-    pub accounting: Accounting,
+    pub accounting_at_start: Accounting,
     /// The accounting at the end of the last callback, and what the thread did during it.
-    pub after: Accounting,
+    pub accounting_at_end: Accounting,
     pub states: [u64; thread_state::COUNT],
 }
 
@@ -94,26 +94,26 @@ pub struct Entry {
 }
 
 /// The running thread, and the state of its process.
-pub struct Current {
+pub struct CallContext {
     pub process: u32,
     pub thread: u32,
     state: *mut Process,
 }
 
-impl Current {
+impl CallContext {
     /// Counts a call, and returns the thread that makes it; `None` if only the number of calls is
     /// counted.
     #[inline(always)]
-    pub fn of_call() -> Option<Self> {
+    pub fn count_call() -> Option<Self> {
         let id = bpf_get_current_pid_tgid();
         let (process, thread) = ((id >> 32) as u32, id as u32);
         count(Counter::Hits);
         let state = match PROCESSES.get_ptr_mut(&process) {
             Some(state) => state,
-            None => create(process)?,
+            None => create_process(process)?,
         };
         // SAFETY: a map value pointer checked against null.
-        add(unsafe { &raw mut (*state).hits }, 1);
+        atomic_add(unsafe { &raw mut (*state).hits }, 1);
         // SAFETY: as above.
         match unsafe { core::ptr::read_volatile(&raw const (*state).state) } {
             state::COUNTED => Some(Self {
@@ -138,25 +138,25 @@ impl Current {
         }
         let new = NEW_FIGURES.get_ptr(0)?;
         // SAFETY: a map value pointer checked against null, of an element that is never written.
-        let _ = HANDLES.insert(&key, unsafe { &*new }, CREATE);
+        let _ = HANDLES.insert(&key, unsafe { &*new }, BPF_NOEXIST);
         let figures = HANDLES.get_ptr_mut(&key);
         if figures.is_none() {
             count(Counter::HandlesFull);
-            // SAFETY: as in `of_call`.
-            add(unsafe { &raw mut (*self.state).refused }, 1);
+            // SAFETY: as in `count_call`.
+            atomic_add(unsafe { &raw mut (*self.state).refused }, 1);
         }
         figures
     }
 
     /// Returns the figures of a handle, if they exist.
     #[inline(always)]
-    pub fn known_figures(&self, address: u64, kind: u32) -> Option<*mut Figures> {
+    pub fn existing_figures(&self, address: u64, kind: u32) -> Option<*mut Figures> {
         HANDLES.get_ptr_mut(&self.handle(address, kind))
     }
 
     /// Removes the figures of a handle whose address belongs to a new object.
     #[inline(always)]
-    pub fn renew(&self, address: u64, kind: u32) {
+    pub fn remove_figures(&self, address: u64, kind: u32) {
         let _ = HANDLES.remove(&self.handle(address, kind));
     }
 
@@ -174,7 +174,7 @@ impl Current {
 
     /// Returns the last calls of this thread, if any are remembered.
     #[inline(always)]
-    pub fn known_thread(&self) -> Option<*mut Thread> {
+    pub fn existing_thread(&self) -> Option<*mut Thread> {
         THREADS.get_ptr_mut(&self.thread)
     }
 
@@ -190,28 +190,28 @@ impl Current {
 
     /// Returns the offset of `rmw_handle` in this process's rcl structures; 0 = unknown.
     #[inline(always)]
-    pub fn rmw_handle_at(&self) -> u32 {
+    pub fn rmw_handle_offset(&self) -> u32 {
         // SAFETY: a map value pointer checked against null.
         unsafe { core::ptr::read_volatile(&raw const (*self.state).rmw_handle_at) }
     }
 
     /// Notes the offset of `rmw_handle` in this process.
     #[inline(always)]
-    pub fn found_rmw_handle(&self, offset: u32) {
+    pub fn set_rmw_handle_offset(&self, offset: u32) {
         // SAFETY: as above; racing threads write the same value.
         unsafe { core::ptr::write_volatile(&raw mut (*self.state).rmw_handle_at, offset) }
     }
 
     /// Returns the offset of the period in this process's timers; 0 = unknown.
     #[inline(always)]
-    pub fn timer_period_at(&self) -> u32 {
+    pub fn timer_period_offset(&self) -> u32 {
         // SAFETY: as above.
         unsafe { core::ptr::read_volatile(&raw const (*self.state).timer_period_at) }
     }
 
     /// Notes the offset of the period in this process's timers.
     #[inline(always)]
-    pub fn found_timer_period(&self, offset: u32) {
+    pub fn set_timer_period_offset(&self, offset: u32) {
         // SAFETY: as above; racing threads write the same value.
         unsafe { core::ptr::write_volatile(&raw mut (*self.state).timer_period_at, offset) }
     }
@@ -219,11 +219,11 @@ impl Current {
 
 /// Creates the state of a process; `None` if the table is full.
 #[inline(always)]
-fn create(process: u32) -> Option<*mut Process> {
+fn create_process(process: u32) -> Option<*mut Process> {
     let new = Process {
         hits: 0,
         refused: 0,
-        state: if is_within() {
+        state: if is_in_target_cgroup() {
             state::COUNTED
         } else {
             state::OUTSIDE
@@ -232,7 +232,7 @@ fn create(process: u32) -> Option<*mut Process> {
         timer_period_at: 0,
         unused: 0,
     };
-    let _ = PROCESSES.insert(&process, &new, CREATE);
+    let _ = PROCESSES.insert(&process, &new, BPF_NOEXIST);
     let state = PROCESSES.get_ptr_mut(&process);
     if state.is_none() {
         count(Counter::ProcessesFull);
@@ -245,15 +245,15 @@ fn create(process: u32) -> Option<*mut Process> {
 /// # Safety
 /// `figures` is a map value.
 #[inline(always)]
-pub unsafe fn event(figures: *mut Figures, now: u64) {
+pub unsafe fn count_event(figures: *mut Figures, now: u64) {
     // SAFETY: as required of the caller.
     unsafe {
-        add(&raw mut (*figures).count, 1);
+        atomic_add(&raw mut (*figures).count, 1);
         let last = core::ptr::read_volatile(&raw const (*figures).last);
         core::ptr::write_volatile(&raw mut (*figures).last, now);
         // Another thread may have read the clock in between.
         if last != 0 && now > last {
-            observe(figures, distribution::INTERVAL, now - last);
+            record_duration(figures, distribution::INTERVAL, now - last);
         }
     }
 }
@@ -263,33 +263,33 @@ pub unsafe fn event(figures: *mut Figures, now: u64) {
 /// # Safety
 /// `figures` is a map value.
 #[inline(always)]
-pub unsafe fn observe(figures: *mut Figures, of: usize, nanoseconds: u64) {
-    // SAFETY: as required of the caller; `of` is one of two, and the bucket is masked below.
+pub unsafe fn record_duration(figures: *mut Figures, which: usize, nanoseconds: u64) {
+    // SAFETY: as required of the caller; `which` is one of two, and the bucket is masked below.
     unsafe {
-        add(
-            (&raw mut (*figures).sums).cast::<u64>().add(of),
+        atomic_add(
+            (&raw mut (*figures).sums).cast::<u64>().add(which),
             nanoseconds,
         );
-        let maximum = (&raw mut (*figures).maxima).cast::<u64>().add(of);
+        let maximum = (&raw mut (*figures).maxima).cast::<u64>().add(which);
         if core::ptr::read_volatile(maximum) < nanoseconds {
             core::ptr::write_volatile(maximum, nanoseconds);
         }
-        let minimum = (&raw mut (*figures).minima).cast::<u64>().add(of);
-        let least = core::ptr::read_volatile(minimum);
-        if least == 0 || nanoseconds + 1 < least {
+        let minimum = (&raw mut (*figures).minima).cast::<u64>().add(which);
+        let minimum_plus_one = core::ptr::read_volatile(minimum);
+        if minimum_plus_one == 0 || nanoseconds + 1 < minimum_plus_one {
             core::ptr::write_volatile(minimum, nanoseconds + 1);
         }
-        let index = opaque(bucket(nanoseconds) as u32) & 0x7f;
+        let index = hide_bounds(bucket(nanoseconds) as u32) & 0x7f;
         if index < BUCKETS as u64 {
             let buckets = (&raw mut (*figures).buckets).cast::<u32>();
-            increment(buckets.add(of * BUCKETS).add(index as usize));
+            atomic_increment(buckets.add(which * BUCKETS).add(index as usize));
         }
     }
 }
 
 /// Adds 1 to a field of a map value.
 #[inline(always)]
-fn increment(to: *mut u32) {
+fn atomic_increment(to: *mut u32) {
     let by = 1_u64;
     // SAFETY: as in `add`.
     unsafe {
@@ -307,7 +307,7 @@ fn increment(to: *mut u32) {
 pub fn count(counter: Counter) {
     if let Some(counters) = INSIDE_COUNTERS.get_ptr_mut(0) {
         // SAFETY: a map value pointer checked against null, and an index within the value.
-        add(unsafe { counters.cast::<u64>().add(counter as usize) }, 1);
+        atomic_add(unsafe { counters.cast::<u64>().add(counter as usize) }, 1);
     }
 }
 
@@ -321,8 +321,8 @@ pub fn now() -> u64 {
 /// Converts CLOCK_MONOTONIC to nanoseconds since the Unix epoch; 0 before user space has set the
 /// difference.
 #[inline(always)]
-pub fn calendar(monotonic: u64) -> u64 {
-    match difference(clock::REALTIME) {
+pub fn realtime_ns(monotonic: u64) -> u64 {
+    match clock_offset(clock::REALTIME) {
         0 => 0,
         difference => difference.wrapping_add(monotonic),
     }
@@ -330,12 +330,12 @@ pub fn calendar(monotonic: u64) -> u64 {
 
 /// Converts CLOCK_MONOTONIC to CLOCK_MONOTONIC_RAW.
 #[inline(always)]
-pub fn raw(monotonic: u64) -> u64 {
-    difference(clock::MONOTONIC_RAW).wrapping_add(monotonic)
+pub fn monotonic_raw_ns(monotonic: u64) -> u64 {
+    clock_offset(clock::MONOTONIC_RAW).wrapping_add(monotonic)
 }
 
 #[inline(always)]
-fn difference(to: u32) -> u64 {
+fn clock_offset(to: u32) -> u64 {
     match CLOCKS.get_ptr(to) {
         // SAFETY: a map value pointer checked against null.
         Some(difference) => unsafe { core::ptr::read_volatile(difference) },
@@ -348,7 +348,7 @@ fn difference(to: u32) -> u64 {
 /// The function returns no `Option`: LLVM would keep the value of a failed read on the stack,
 /// uninitialized, and Linux 5.10 refuses a program that loads it.
 #[inline(always)]
-pub fn read<T: Copy>(address: u64) -> T {
+pub fn read_user<T: Copy>(address: u64) -> T {
     let mut value = MaybeUninit::<T>::uninit();
     // SAFETY: the destination has the size given; the kernel checks the address, and writes zeros
     // if it is wrong. Only integers and arrays of them are read.

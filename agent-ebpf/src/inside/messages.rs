@@ -6,28 +6,30 @@ use ros2probe_wire::inside::{distribution, kind};
 
 use crate::{
     callbacks,
-    instructions::add,
-    maps::{CALLBACKS, Current, Entry, WAITING, calendar, event, now, observe},
+    instructions::atomic_add,
+    maps::{
+        CALLBACKS, CallContext, Entry, WAITING, count_event, now, realtime_ns, record_duration,
+    },
     names,
-    settings::setting,
+    settings::read_global,
 };
 
 /// Handles a publication to the middleware, or the preceding one `within` the process.
 #[inline(always)]
 pub fn published(publisher: u64, within: bool) {
-    let Some(current) = Current::of_call() else {
+    let Some(current) = CallContext::count_call() else {
         return;
     };
     let now = now();
-    let thread = current.known_thread();
+    let thread = current.existing_thread();
     if !within {
         // This may be the second call for a message that was also passed within the process.
         if let Some(thread) = thread {
             // SAFETY: a map value pointer checked against null, of the running thread.
-            let is_counted = unsafe { (*thread).publisher } == publisher;
+            let is_counted = unsafe { (*thread).intra_process_publisher } == publisher;
             if is_counted {
                 // SAFETY: as above.
-                unsafe { (*thread).publisher = 0 };
+                unsafe { (*thread).intra_process_publisher = 0 };
                 return;
             }
         }
@@ -36,45 +38,45 @@ pub fn published(publisher: u64, within: bool) {
         return;
     };
     // SAFETY: a map value pointer checked against null.
-    unsafe { event(figures, now) };
-    names::publisher(&current, figures, publisher);
+    unsafe { count_event(figures, now) };
+    names::announce_publisher(&current, figures, publisher);
     if within {
         // SAFETY: as above.
-        add(unsafe { &raw mut (*figures).within }, 1);
+        atomic_add(unsafe { &raw mut (*figures).within }, 1);
         if let Some(thread) = current.thread() {
             // SAFETY: as above.
-            unsafe { (*thread).publisher = publisher };
+            unsafe { (*thread).intra_process_publisher = publisher };
         }
     }
-    if setting(&CALLBACKS) != 0 {
+    if read_global(&CALLBACKS) != 0 {
         callbacks::published(&current, publisher, within, now);
     }
 }
 
 /// Handles a take from the middleware, or an attempt.
 #[inline(always)]
-pub fn taken(subscription: u64, source_timestamp: u64, taken: bool) {
-    let Some(current) = Current::of_call() else {
+pub fn taken(subscription: u64, source_timestamp: u64, has_message: bool) {
+    let Some(current) = CallContext::count_call() else {
         return;
     };
     let Some(figures) = current.figures(subscription, kind::SUBSCRIPTION) else {
         return;
     };
-    names::subscription(&current, figures, subscription);
-    if !taken {
+    names::announce_subscription(&current, figures, subscription);
+    if !has_message {
         // SAFETY: a map value pointer checked against null.
-        add(unsafe { &raw mut (*figures).failed }, 1);
+        atomic_add(unsafe { &raw mut (*figures).failed }, 1);
         return;
     }
     let now = now();
     // SAFETY: as above.
-    unsafe { event(figures, now) };
-    let calendar = calendar(now);
+    unsafe { count_event(figures, now) };
+    let calendar = realtime_ns(now);
     if source_timestamp != 0 && calendar > source_timestamp {
         // SAFETY: as above.
-        unsafe { observe(figures, distribution::DELAY, calendar - source_timestamp) };
+        unsafe { record_duration(figures, distribution::DELAY, calendar - source_timestamp) };
     }
-    if setting(&CALLBACKS) == 0 {
+    if read_global(&CALLBACKS) == 0 {
         return;
     }
     if let Some(thread) = current.thread() {
@@ -90,20 +92,20 @@ pub fn taken(subscription: u64, source_timestamp: u64, taken: bool) {
 /// Counts a message that was taken without `rmw_take`, at the start of its callback. Its source
 /// timestamp is unknown.
 #[inline(always)]
-pub fn taken_unseen(current: &Current, subscription: u64, now: u64) {
+pub fn count_untraced_take(current: &CallContext, subscription: u64, now: u64) {
     let Some(figures) = current.figures(subscription, kind::SUBSCRIPTION) else {
         return;
     };
-    names::subscription(current, figures, subscription);
+    names::announce_subscription(current, figures, subscription);
     // SAFETY: a map value pointer checked against null.
-    unsafe { event(figures, now) };
+    unsafe { count_event(figures, now) };
 }
 
 /// Handles a message that enters a ring buffer. `size` is the number of messages in the buffer
 /// afterwards, one too many if a message is overwritten.
 #[inline(always)]
 pub fn enqueued(buffer: u64, index: u64, size: u32, overwritten: bool) {
-    let Some(current) = Current::of_call() else {
+    let Some(current) = CallContext::count_call() else {
         return;
     };
     let Some(figures) = current.figures(buffer, kind::BUFFER) else {
@@ -113,39 +115,39 @@ pub fn enqueued(buffer: u64, index: u64, size: u32, overwritten: bool) {
     let depth = size.wrapping_sub(u32::from(overwritten));
     // SAFETY: a map value pointer checked against null.
     unsafe {
-        event(figures, now);
+        count_event(figures, now);
         if overwritten {
-            add(&raw mut (*figures).failed, 1);
+            atomic_add(&raw mut (*figures).failed, 1);
         }
         write_volatile(&raw mut (*figures).depth, depth);
         if read_volatile(&raw const (*figures).max_depth) < depth {
             write_volatile(&raw mut (*figures).max_depth, depth);
         }
     }
-    if let Some(thread) = current.known_thread() {
+    if let Some(thread) = current.existing_thread() {
         // SAFETY: as above. The publication that fills the buffers precedes this call in the same
         // thread.
         unsafe {
-            let publisher = (*thread).publisher;
+            let publisher = (*thread).intra_process_publisher;
             if publisher != 0 {
                 (*figures).trigger = current.handle(publisher, kind::PUBLISHER);
             }
         }
     }
-    let _ = WAITING.insert(&entry(&current, buffer, index), &now, 0);
+    let _ = WAITING.insert(&buffer_slot(&current, buffer, index), &now, 0);
 }
 
 /// Handles a message that leaves a ring buffer.
 #[inline(always)]
 pub fn dequeued(buffer: u64, index: u64, size: u32) {
-    let Some(current) = Current::of_call() else {
+    let Some(current) = CallContext::count_call() else {
         return;
     };
     let Some(figures) = current.figures(buffer, kind::BUFFER) else {
         return;
     };
     let now = now();
-    let key = entry(&current, buffer, index);
+    let key = buffer_slot(&current, buffer, index);
     let entered = match WAITING.get_ptr(&key) {
         // SAFETY: a map value pointer checked against null.
         Some(entered) => unsafe { *entered },
@@ -153,26 +155,30 @@ pub fn dequeued(buffer: u64, index: u64, size: u32) {
     };
     // SAFETY: as above.
     unsafe {
-        add(&raw mut (*figures).within, 1);
+        atomic_add(&raw mut (*figures).within, 1);
         write_volatile(&raw mut (*figures).depth, size);
         if entered != 0 && now > entered {
-            observe(figures, distribution::DELAY, now - entered);
+            record_duration(figures, distribution::DELAY, now - entered);
         }
     }
     if entered != 0 {
         let _ = WAITING.remove(&key);
     }
-    if setting(&CALLBACKS) == 0 {
+    if read_global(&CALLBACKS) == 0 {
         return;
     }
     if let Some(thread) = current.thread() {
-        let source_timestamp = if entered == 0 { 0 } else { calendar(entered) };
+        let source_timestamp = if entered == 0 {
+            0
+        } else {
+            realtime_ns(entered)
+        };
         // SAFETY: as above, of the running thread.
         unsafe {
             (*thread).input = current.handle(buffer, kind::BUFFER);
             (*thread).source_timestamp = source_timestamp;
             (*thread).taken = now;
-            (*thread).entered = entered;
+            (*thread).enqueued_ns = entered;
         }
     }
 }
@@ -180,17 +186,17 @@ pub fn dequeued(buffer: u64, index: u64, size: u32) {
 /// Records that a ring buffer was emptied.
 #[inline(always)]
 pub fn cleared(buffer: u64) {
-    let Some(current) = Current::of_call() else {
+    let Some(current) = CallContext::count_call() else {
         return;
     };
-    if let Some(figures) = current.known_figures(buffer, kind::BUFFER) {
+    if let Some(figures) = current.existing_figures(buffer, kind::BUFFER) {
         // SAFETY: a map value pointer checked against null.
         unsafe { write_volatile(&raw mut (*figures).depth, 0) };
     }
 }
 
 #[inline(always)]
-fn entry(current: &Current, buffer: u64, index: u64) -> Entry {
+fn buffer_slot(current: &CallContext, buffer: u64, index: u64) -> Entry {
     Entry {
         buffer,
         process: current.process,

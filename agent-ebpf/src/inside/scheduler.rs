@@ -32,26 +32,26 @@ use ros2probe_wire::inside::{
 };
 
 use crate::{
-    accounting::{least, throttled, word},
-    instructions::opaque,
+    accounting::{min, read_u64, throttled},
+    instructions::hide_bounds,
     late::{
-        Followed, add_runnable, clear, copy, follow, followed, forget, is_any_runnable,
-        is_followed, role, state,
+        Followed, add_runnable, copy, follow, followed, forget, is_any_runnable, is_followed,
+        reset_activity, role, state,
     },
     maps::now,
     registers::is_aarch64,
 };
 
 /// Runs of threads that a CPU remembers; a power of two.
-const RUNS: usize = 64;
+const RUN_HISTORY_LEN: usize = 64;
 /// Waits below this time are not divided among other threads, in nanoseconds.
-const SHORT: u64 = 20_000;
+const MIN_ATTRIBUTED_WAIT_NS: u64 = 20_000;
 
 /// Minimum of a wait that is not one for a lock of the middleware, in nanoseconds.
-const LONG: u64 = 1_000_000;
+const MIN_MESSAGE_WAIT_NS: u64 = 1_000_000;
 
 /// States of `task_struct.__state` (include/linux/sched.h).
-mod task {
+mod task_state {
     pub const UNINTERRUPTIBLE: u64 = 2;
     pub const STOPPED_OR_TRACED: u64 = 4 | 8;
     pub const DEAD: u64 = 0x80;
@@ -61,8 +61,8 @@ mod task {
 /// A run of a thread on a CPU.
 #[repr(C)]
 #[derive(Clone, Copy)]
-struct Run {
-    until: u64,
+struct ThreadRun {
+    end_ns: u64,
     /// Thread id in the low half, process id in the high half.
     id: u64,
     name: [u64; NAME_BYTES / 8],
@@ -74,24 +74,24 @@ struct Run {
 /// The last runs of a CPU. Only those are present during which a followed thread could run.
 #[repr(C)]
 #[derive(Clone, Copy)]
-struct Runs {
+struct RunHistory {
     /// Number of runs so far.
     count: u64,
-    runs: [Run; RUNS],
+    runs: [ThreadRun; RUN_HISTORY_LEN],
 }
 
 #[map]
-static CPU_RUNS: PerCpuArray<Runs> = PerCpuArray::with_max_entries(1, 0);
+static CPU_RUNS: PerCpuArray<RunHistory> = PerCpuArray::with_max_entries(1, 0);
 
 /// `sched_switch(preempt, prev, next)`, in the context of `prev`.
 #[inline(always)]
-pub fn switched(context: &RawTracePointContext) {
+pub fn on_sched_switch(context: &RawTracePointContext) {
     let id = bpf_get_current_pid_tgid();
-    let (leaving, next): (u32, u64) = (thread_of(id), context.arg(2));
-    let entering = number(next, THREAD);
-    let (leaves, enters) = (is_followed(leaving), is_followed(entering));
+    let (prev_tid, next): (u32, u64) = (tid(id), context.arg(2));
+    let next_tid = read_task_u32(next, THREAD);
+    let (is_prev_followed, is_next_followed) = (is_followed(prev_tid), is_followed(next_tid));
     let is_any_runnable = is_any_runnable();
-    if !leaves && !enters && !is_any_runnable {
+    if !is_prev_followed && !is_next_followed && !is_any_runnable {
         return;
     }
     let now = now();
@@ -100,23 +100,23 @@ pub fn switched(context: &RawTracePointContext) {
     };
     if is_any_runnable {
         // SAFETY: a map value pointer checked against null.
-        unsafe { remember(runs, id, now) };
+        unsafe { record_run(runs, id, now) };
     }
-    if leaves && let Some(followed) = followed(leaving) {
+    if is_prev_followed && let Some(followed) = followed(prev_tid) {
         let is_preempted: u64 = context.arg(0);
         // SAFETY: as above.
-        unsafe { left(followed, leaving, is_preempted as u8 != 0, now) };
+        unsafe { on_switch_out(followed, prev_tid, is_preempted as u8 != 0, now) };
     }
-    if enters && let Some(followed) = followed(entering) {
+    if is_next_followed && let Some(followed) = followed(next_tid) {
         // SAFETY: as above.
-        unsafe { entered(followed, runs, next, now) };
+        unsafe { on_switch_in(followed, runs, next, now) };
     }
 }
 
 /// `sched_waking(task)`, in the context of the thread or interrupt that wakes it.
 #[inline(always)]
-pub fn woken(context: &RawTracePointContext) {
-    let thread = number(context.arg(0), THREAD);
+pub fn on_sched_waking(context: &RawTracePointContext) {
+    let thread = read_task_u32(context.arg(0), THREAD);
     if !is_followed(thread) {
         return;
     }
@@ -130,21 +130,21 @@ pub fn woken(context: &RawTracePointContext) {
         }
         let now = now();
         let id = bpf_get_current_pid_tgid();
-        (*followed).wait.waker = thread_of(id);
-        (*followed).wait.waker_process = (id >> 32) as u32;
-        let name = (&raw mut (*followed).wait.waker_name).cast();
+        (*followed).current_wait.waker = tid(id);
+        (*followed).current_wait.waker_process = (id >> 32) as u32;
+        let name = (&raw mut (*followed).current_wait.waker_name).cast();
         bpf_get_current_comm(name, NAME_BYTES as u32);
-        (*followed).wait.waker_cgroup_id = bpf_get_current_cgroup_id();
-        unblocked(followed, now);
+        (*followed).current_wait.waker_cgroup_id = bpf_get_current_cgroup_id();
+        end_wait(followed, now);
         let role = (*followed).role;
         if role == role::RECEIVER {
-            receiver_woken(followed, context.arg(0), now);
+            on_receiver_wakeup(followed, context.arg(0), now);
         } else if role == role::EXECUTOR {
-            executor_woken(followed, id, now);
+            on_executor_wakeup(followed, id, now);
         }
         (*followed).state = state::RUNNABLE;
-        (*followed).since = now;
-        (*followed).woken = now;
+        (*followed).state_since_ns = now;
+        (*followed).last_wakeup_ns = now;
         add_runnable(1);
     }
 }
@@ -153,22 +153,24 @@ pub fn woken(context: &RawTracePointContext) {
 /// another process that wakes it in shared memory. Another thread of its own process may have
 /// received one. All other waits delay the message.
 #[inline(always)]
-unsafe fn receiver_woken(receiver: *mut Followed, task: u64, now: u64) {
+unsafe fn on_receiver_wakeup(receiver: *mut Followed, task: u64, now: u64) {
     // SAFETY: a map value, by the caller.
     unsafe {
-        let kind = (*receiver).wait.kind;
-        let is_own = u64::from((*receiver).wait.waker_process) == (*receiver).process;
+        let kind = (*receiver).current_wait.kind;
+        let is_own = u64::from((*receiver).current_wait.waker_process) == (*receiver).process;
         let is_shared = kind == wait::LOCK as u32 && !is_own;
         if kind != wait::OTHER as u32 && !is_shared {
-            if kind == wait::LOCK as u32 && (*receiver).wait.nanoseconds > LONG {
+            if kind == wait::LOCK as u32
+                && (*receiver).current_wait.nanoseconds > MIN_MESSAGE_WAIT_NS
+            {
                 (*receiver).handoff.woken = 0;
-                clear(receiver);
+                reset_activity(receiver);
             }
             return;
         }
-        clear(receiver);
+        reset_activity(receiver);
         copy(
-            &raw const (*receiver).wait,
+            &raw const (*receiver).current_wait,
             &raw mut (*receiver).handoff.wait,
         );
         (*receiver).handoff.woken = now;
@@ -176,35 +178,36 @@ unsafe fn receiver_woken(receiver: *mut Followed, task: u64, now: u64) {
     }
 }
 
-/// Handles that the running thread ends a wait of a thread that calls callbacks. A long wait is that
-/// for a message, and short ones for locks of the middleware may follow it. An executor's thread
-/// wakes others after each call, because the callback group of that call may have further ones.
+/// Handles that the running thread ends a wait of a thread that calls callbacks. A long wait is
+/// that for a message, and short ones for locks of the middleware may follow it. An executor's
+/// thread wakes others after each call, because the callback group of that call may have further
+/// ones.
 #[inline(always)]
-unsafe fn executor_woken(executor: *mut Followed, id: u64, now: u64) {
+unsafe fn on_executor_wakeup(executor: *mut Followed, id: u64, now: u64) {
     // SAFETY: map values, by the caller.
     unsafe {
-        if (*executor).wait.kind != wait::LOCK as u32 || id >> 32 != (*executor).process {
+        if (*executor).current_wait.kind != wait::LOCK as u32 || id >> 32 != (*executor).process {
             return;
         }
-        let Some(receiver) = follow(thread_of(id)) else {
+        let Some(receiver) = follow(tid(id)) else {
             return;
         };
         let role = (*receiver).role;
         if role == role::NONE {
             (*receiver).role = role::RECEIVER;
             (*receiver).process = id >> 32;
-            (*receiver).since = now;
+            (*receiver).state_since_ns = now;
         } else if role != role::RECEIVER {
             if role == role::EXECUTOR {
-                released(executor, receiver, now);
+                note_release(executor, receiver, now);
             }
             return;
         }
-        let waited = (*executor).wait.nanoseconds;
-        if waited <= (*executor).handoff_wait && waited <= LONG {
+        let waited = (*executor).current_wait.nanoseconds;
+        if waited <= (*executor).wait_before_handoff_ns && waited <= MIN_MESSAGE_WAIT_NS {
             return;
         }
-        (*executor).handoff_wait = waited;
+        (*executor).wait_before_handoff_ns = waited;
         let handoff = &raw mut (*executor).handoff;
         let woken = (*receiver).handoff.woken;
         (*handoff).at = now;
@@ -224,7 +227,7 @@ unsafe fn executor_woken(executor: *mut Followed, id: u64, now: u64) {
         if runnable >= STALL {
             let throttled = throttled(bpf_get_current_task());
             let throttled = throttled.wrapping_sub((*receiver).throttled);
-            (*handoff).throttled = least(throttled, runnable);
+            (*handoff).throttled = min(throttled, runnable);
             copy(
                 &raw const (*receiver).activity.others,
                 &raw mut (*handoff).others,
@@ -236,15 +239,15 @@ unsafe fn executor_woken(executor: *mut Followed, id: u64, now: u64) {
 /// Handles that one thread of an executor wakes another one: it has just ended a call, or it was
 /// itself woken after one, and passes on the right to wait for work.
 #[inline(always)]
-unsafe fn released(woken: *mut Followed, waker: *const Followed, now: u64) {
+unsafe fn note_release(woken: *mut Followed, waker: *const Followed, now: u64) {
     // SAFETY: map values, by the caller.
     unsafe {
-        let of = |call: *const Call| now - read_volatile(&raw const (*call).ended) < RELEASE;
-        let mut call = &raw const (*waker).previous;
-        if !of(call) {
+        let is_recent = |call: *const Call| now - read_volatile(&raw const (*call).ended) < RELEASE;
+        let mut call = &raw const (*waker).previous_call;
+        if !is_recent(call) {
             call = &raw const (*waker).released_by;
         }
-        if of(call) {
+        if is_recent(call) {
             copy(call, &raw mut (*woken).released_by);
         }
     }
@@ -252,32 +255,35 @@ unsafe fn released(woken: *mut Followed, waker: *const Followed, now: u64) {
 
 /// Ends the present wait.
 #[inline(always)]
-unsafe fn unblocked(followed: *mut Followed, now: u64) {
+unsafe fn end_wait(followed: *mut Followed, now: u64) {
     // SAFETY: a map value, by the caller.
     unsafe {
-        let since = (*followed).since;
+        let since = (*followed).state_since_ns;
         // The clocks of two CPUs may differ by nanoseconds.
         let waited = if now > since { now - since } else { 0 };
-        (*followed).wait.nanoseconds = waited;
-        block(followed, waited);
+        (*followed).current_wait.nanoseconds = waited;
+        add_blocked_time(followed, waited);
         if waited > (*followed).activity.longest.nanoseconds {
             copy(
-                &raw const (*followed).wait,
+                &raw const (*followed).current_wait,
                 &raw mut (*followed).activity.longest,
             );
         }
-        if (*followed).wait.kind == wait::STOPPED as u32 {
-            copy(&raw const (*followed).wait, &raw mut (*followed).stop);
-            (*followed).stop_ended = now;
+        if (*followed).current_wait.kind == wait::STOPPED as u32 {
+            copy(
+                &raw const (*followed).current_wait,
+                &raw mut (*followed).last_stop,
+            );
+            (*followed).last_stop_end_ns = now;
         }
     }
 }
 
 /// Adds a time to the waits of the present kind.
 #[inline(always)]
-unsafe fn block(followed: *mut Followed, nanoseconds: u64) {
+unsafe fn add_blocked_time(followed: *mut Followed, nanoseconds: u64) {
     let blocked = (unsafe { &raw mut (*followed).activity.blocked }).cast::<u64>();
-    let kind = opaque(unsafe { (*followed).wait.kind }) & 7;
+    let kind = hide_bounds(unsafe { (*followed).current_wait.kind }) & 7;
     if kind < wait::COUNT as u64 {
         // SAFETY: a map value, by the caller, and an index within the array.
         unsafe { *blocked.add(kind as usize) += nanoseconds };
@@ -286,156 +292,168 @@ unsafe fn block(followed: *mut Followed, nanoseconds: u64) {
 
 /// Handles that a followed thread leaves its CPU.
 #[inline(always)]
-unsafe fn left(followed: *mut Followed, thread: u32, is_preempted: bool, now: u64) {
+unsafe fn on_switch_out(followed: *mut Followed, thread: u32, is_preempted: bool, now: u64) {
     let task = unsafe { bpf_get_current_task() };
-    let charged = word(task, RUNTIME).unwrap_or(0);
-    let run_delay = word(task, RUN_DELAY).unwrap_or(0);
+    let charged = read_u64(task, RUNTIME).unwrap_or(0);
+    let run_delay = read_u64(task, RUN_DELAY).unwrap_or(0);
     // SAFETY: a map value, by the caller.
     unsafe {
-        let since = (*followed).since;
+        let since = (*followed).state_since_ns;
         let span = now - since;
-        let was = (*followed).state;
-        if was == state::RUNNING {
+        let previous_state = (*followed).state;
+        if previous_state == state::RUNNING {
             (*followed).activity.cpu += span;
-            let entered = (*followed).entered;
+            let entered = (*followed).on_cpu_since_ns;
             if entered != 0 {
-                let ran = now - entered;
-                let counted = charged.wrapping_sub((*followed).charged);
-                (*followed).activity.stolen += ran - least(counted, ran);
+                let ran_ns = now - entered;
+                let charged_ns = charged.wrapping_sub((*followed).sum_exec_runtime_ns);
+                (*followed).activity.stolen += ran_ns - min(charged_ns, ran_ns);
             }
         } else {
             // It entered the CPU without an event.
-            let waited = least(run_delay.wrapping_sub((*followed).run_delay), span);
-            let rest = span - waited;
-            let ran = least(charged.wrapping_sub((*followed).charged), rest);
+            let waited = min(run_delay.wrapping_sub((*followed).run_delay), span);
+            let remaining_ns = span - waited;
+            let ran_ns = min(
+                charged.wrapping_sub((*followed).sum_exec_runtime_ns),
+                remaining_ns,
+            );
             (*followed).activity.runnable += waited;
             (*followed).activity.missed += 1;
-            if was == state::RUNNABLE {
-                (*followed).activity.cpu += rest;
+            if previous_state == state::RUNNABLE {
+                (*followed).activity.cpu += remaining_ns;
                 add_runnable(-1);
             } else {
-                (*followed).activity.cpu += ran;
-                block(followed, rest - ran);
+                (*followed).activity.cpu += ran_ns;
+                add_blocked_time(followed, remaining_ns - ran_ns);
             }
         }
-        (*followed).charged = charged;
+        (*followed).sum_exec_runtime_ns = charged;
         (*followed).run_delay = run_delay;
-        (*followed).since = now;
-        (*followed).entered = 0;
-        let state = u64::from(number(task, STATE));
-        if state & task::DEAD != 0 {
+        (*followed).state_since_ns = now;
+        (*followed).on_cpu_since_ns = 0;
+        let state = u64::from(read_task_u32(task, STATE));
+        if state & task_state::DEAD != 0 {
             forget(thread);
-        } else if is_preempted || state == 0 || state == task::WAKING {
+        } else if is_preempted || state == 0 || state == task_state::WAKING {
             (*followed).state = state::RUNNABLE;
             add_runnable(1);
         } else {
             (*followed).state = state::BLOCKED;
-            begin_wait(&raw mut (*followed).wait, state);
+            start_wait(&raw mut (*followed).current_wait, state);
         }
     }
 }
 
 /// Handles that a followed thread enters a CPU.
 #[inline(always)]
-unsafe fn entered(followed: *mut Followed, runs: *const Runs, task: u64, now: u64) {
+unsafe fn on_switch_in(followed: *mut Followed, runs: *const RunHistory, task: u64, now: u64) {
     // SAFETY: map values, by the caller.
     unsafe {
-        let since = (*followed).since;
-        let was = (*followed).state;
-        if was == state::RUNNABLE {
+        let since = (*followed).state_since_ns;
+        let previous_state = (*followed).state;
+        if previous_state == state::RUNNABLE {
             let waited = now - since;
             (*followed).activity.runnable += waited;
-            if waited > SHORT {
-                attribute(&raw mut (*followed).activity, runs, since);
+            if waited > MIN_ATTRIBUTED_WAIT_NS {
+                attribute_wait(&raw mut (*followed).activity, runs, since);
             }
             add_runnable(-1);
-        } else if was == state::BLOCKED {
+        } else if previous_state == state::BLOCKED {
             (*followed).activity.missed += 1;
-            unblocked(followed, now);
+            end_wait(followed, now);
         }
         (*followed).state = state::RUNNING;
-        (*followed).since = now;
-        (*followed).entered = now;
-        (*followed).charged = word(task, RUNTIME).unwrap_or(0);
+        (*followed).state_since_ns = now;
+        (*followed).on_cpu_since_ns = now;
+        (*followed).sum_exec_runtime_ns = read_u64(task, RUNTIME).unwrap_or(0);
     }
 }
 
 /// Remembers that the running thread leaves its CPU.
 #[inline(always)]
-unsafe fn remember(runs: *mut Runs, id: u64, now: u64) {
+unsafe fn record_run(runs: *mut RunHistory, id: u64, now: u64) {
     // SAFETY: a map value, by the caller, and an index within the array.
     unsafe {
         let count = (*runs).count;
         (*runs).count = count + 1;
-        let index = opaque(count as u32) & (RUNS as u64 - 1);
-        let run = (&raw mut (*runs).runs).cast::<Run>().add(index as usize);
-        (*run).until = now;
+        let index = hide_bounds(count as u32) & (RUN_HISTORY_LEN as u64 - 1);
+        let run = (&raw mut (*runs).runs)
+            .cast::<ThreadRun>()
+            .add(index as usize);
+        (*run).end_ns = now;
         (*run).id = id;
         bpf_get_current_comm((&raw mut (*run).name).cast(), NAME_BYTES as u32);
         (*run).cgroup_id = bpf_get_current_cgroup_id();
         let task = bpf_get_current_task();
-        let priority = read::<i32>(member(task, PRIORITY));
+        let priority = read::<i32>(task_member_address(task, PRIORITY));
         (*run).priority = priority.map_or(UNKNOWN_PRIORITY, i64::from);
     }
 }
 
-/// Adds the runs of this CPU since `since` to those that ran instead. Threads whose ids end with the
-/// same bits share a place: a thread takes it from another one if its run is longer than the time of
-/// that one so far.
+/// Adds the runs of this CPU since `since` to those that ran instead. Threads whose ids end with
+/// the same bits share a place: a thread takes it from another one if its run is longer than the
+/// time of that one so far.
 ///
 /// The body has no branch but the end of the loop, because the verifier would follow each
 /// combination of branches.
 #[inline(always)]
-unsafe fn attribute(activity: *mut Activity, runs: *const Runs, since: u64) {
+unsafe fn attribute_wait(activity: *mut Activity, runs: *const RunHistory, since: u64) {
     // SAFETY: map values, by the caller, and indices within the arrays.
     unsafe {
         let count = read_volatile(&raw const (*runs).count);
-        let all = (&raw const (*runs).runs).cast::<Run>();
-        let mut back = 1;
-        while back < RUNS as u64 {
-            let index = opaque(count.wrapping_sub(back) as u32) & (RUNS as u64 - 1);
-            let earlier = opaque(count.wrapping_sub(back + 1) as u32) & (RUNS as u64 - 1);
+        let all = (&raw const (*runs).runs).cast::<ThreadRun>();
+        let mut age = 1;
+        while age < RUN_HISTORY_LEN as u64 {
+            let index = hide_bounds(count.wrapping_sub(age) as u32) & (RUN_HISTORY_LEN as u64 - 1);
+            let previous_index =
+                hide_bounds(count.wrapping_sub(age + 1) as u32) & (RUN_HISTORY_LEN as u64 - 1);
             let run = all.add(index as usize);
-            let until = read_volatile(&raw const (*run).until);
-            if until <= since {
+            let end_ns = read_volatile(&raw const (*run).end_ns);
+            if end_ns <= since {
                 break;
             }
-            let from = read_volatile(&raw const (*all.add(earlier as usize)).until);
-            let from = select(is_less(from, since), since, from);
-            let ran = until.wrapping_sub(from);
+            let start_ns = read_volatile(&raw const (*all.add(previous_index as usize)).end_ns);
+            let start_ns = select(less_mask(start_ns, since), since, start_ns);
+            let ran_ns = end_ns.wrapping_sub(start_ns);
             let id = read_volatile(&raw const (*run).id);
-            let place = opaque(id as u32) & (OTHERS as u64 - 1);
+            let slot = hide_bounds(id as u32) & (OTHERS as u64 - 1);
             let others = (&raw mut (*activity).others).cast::<Other>();
-            let other = others.add(place as usize).cast::<u64>();
-            let known = read_volatile(other);
+            let other = others.add(slot as usize).cast::<u64>();
+            let known_ns = read_volatile(other);
             let known_id = read_volatile(other.add(1));
-            let is_same = !is_less(0, id ^ known_id);
-            let is_new = is_less(known, ran) & !is_same;
-            write_volatile(other, select(is_new, ran, known + (ran & is_same)));
-            write_volatile(other.add(1), select(is_new, id, known_id));
-            let is_named = is_new | is_same;
+            let same_mask = !less_mask(0, id ^ known_id);
+            let new_mask = less_mask(known_ns, ran_ns) & !same_mask;
+            write_volatile(
+                other,
+                select(new_mask, ran_ns, known_ns + (ran_ns & same_mask)),
+            );
+            write_volatile(other.add(1), select(new_mask, id, known_id));
+            let update_mask = new_mask | same_mask;
             let name = (&raw const (*run).name).cast::<u64>();
             let (low, high) = (read_volatile(name), read_volatile(name.add(1)));
             let (known_low, known_high) =
                 (read_volatile(other.add(2)), read_volatile(other.add(3)));
-            write_volatile(other.add(2), select(is_named, low, known_low));
-            write_volatile(other.add(3), select(is_named, high, known_high));
+            write_volatile(other.add(2), select(update_mask, low, known_low));
+            write_volatile(other.add(3), select(update_mask, high, known_high));
             let (cgroup_id, priority) = (
                 read_volatile(&raw const (*run).cgroup_id),
                 read_volatile(&raw const (*run).priority) as u64,
             );
             let (known_cgroup_id, known_priority) =
                 (read_volatile(other.add(4)), read_volatile(other.add(5)));
-            write_volatile(other.add(4), select(is_named, cgroup_id, known_cgroup_id));
-            write_volatile(other.add(5), select(is_named, priority, known_priority));
-            back += 1;
+            write_volatile(
+                other.add(4),
+                select(update_mask, cgroup_id, known_cgroup_id),
+            );
+            write_volatile(other.add(5), select(update_mask, priority, known_priority));
+            age += 1;
         }
     }
 }
 
 /// Returns all ones if `one` is less than `other`, otherwise 0. Both are below 2^63.
 #[inline(always)]
-fn is_less(one: u64, other: u64) -> u64 {
+fn less_mask(one: u64, other: u64) -> u64 {
     let mut difference = one.wrapping_sub(other);
     // SAFETY: changes only its operand.
     unsafe {
@@ -452,12 +470,12 @@ const fn select(mask: u64, first: u64, second: u64) -> u64 {
 
 /// Notes for what the running thread begins to wait.
 #[inline(always)]
-unsafe fn begin_wait(wait: *mut Blocked, state: u64) {
-    let (number, argument) = system_call();
+unsafe fn start_wait(wait: *mut Blocked, state: u64) {
+    let (syscall_number, argument) = current_syscall();
     // SAFETY: a map value, by the caller.
     unsafe {
-        (*wait).kind = kind_of(state, number) as u32;
-        (*wait).call = number;
+        (*wait).kind = wait_kind(state, syscall_number) as u32;
+        (*wait).call = syscall_number;
         (*wait).argument = argument;
         (*wait).waker = 0;
     }
@@ -465,7 +483,7 @@ unsafe fn begin_wait(wait: *mut Blocked, state: u64) {
 
 /// Returns the number of the running thread's system call, and its first argument.
 #[inline(always)]
-fn system_call() -> (u32, u64) {
+fn current_syscall() -> (u32, u64) {
     // SAFETY: no preconditions; the registers are those of the running thread.
     let registers = unsafe { bpf_task_pt_regs(bpf_get_current_task_btf()) } as u64;
     // `orig_ax` and `di` of x86; `syscallno` and `orig_x0` of AArch64.
@@ -481,23 +499,23 @@ fn system_call() -> (u32, u64) {
 
 /// Returns one of [`wait`].
 #[inline(always)]
-fn kind_of(state: u64, number: u32) -> usize {
-    if state & task::STOPPED_OR_TRACED != 0 {
+fn wait_kind(state: u64, syscall_number: u32) -> usize {
+    if state & task_state::STOPPED_OR_TRACED != 0 {
         return wait::STOPPED;
     }
-    if number == u32::MAX {
+    if syscall_number == u32::MAX {
         return wait::PAGE_FAULT;
     }
-    if state & task::UNINTERRUPTIBLE != 0 {
+    if state & task_state::UNINTERRUPTIBLE != 0 {
         return wait::DISK;
     }
     let (futex, sleep, clock_sleep) = match is_aarch64() {
         true => (98, 101, 115),
         false => (202, 35, 230),
     };
-    if number == futex {
+    if syscall_number == futex {
         wait::LOCK
-    } else if number == sleep || number == clock_sleep {
+    } else if syscall_number == sleep || syscall_number == clock_sleep {
         wait::SLEEP
     } else {
         wait::OTHER
@@ -506,13 +524,13 @@ fn kind_of(state: u64, number: u32) -> usize {
 
 /// Returns a member of 32 bits of a task; 0 if it cannot be read.
 #[inline(always)]
-fn number(task: u64, of: usize) -> u32 {
-    read(member(task, of)).unwrap_or(0)
+fn read_task_u32(task: u64, of: usize) -> u32 {
+    read(task_member_address(task, of)).unwrap_or(0)
 }
 
 /// Returns the address of a member of a task, by `accounting`.
 #[inline(always)]
-fn member(task: u64, of: usize) -> u64 {
+fn task_member_address(task: u64, of: usize) -> u64 {
     task.wrapping_add(u64::from(crate::accounting::offset(of)))
 }
 
@@ -523,6 +541,6 @@ fn read<T: Copy>(address: u64) -> Option<T> {
 }
 
 #[inline(always)]
-const fn thread_of(id: u64) -> u32 {
+const fn tid(id: u64) -> u32 {
     id as u32
 }

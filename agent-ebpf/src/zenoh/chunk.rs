@@ -8,16 +8,16 @@ use aya_ebpf::{
 use core::{mem::size_of, ptr::read_volatile};
 use ros2probe_wire::{
     filter::Counter,
-    host::{Link, PIECE_BYTES, Piece, chunk as part},
+    host::{Link, PIECE_BYTES, Piece, chunk as chunk_flag},
     record::flag,
 };
 
 use crate::{
-    maps::{PIECES, PieceBuffer, WAKE_PIECE_BYTES, count, piece},
+    maps::{PIECES, PieceBuffer, WAKE_PIECE_BYTES, count, piece_buffer},
     packet::IPV4_MAPPED,
-    pieces::bounded,
-    settings::setting,
-    verdict::{AVAILABLE_DATA, FORCE_WAKEUP, NO_WAKEUP},
+    pieces::bounded_piece_len,
+    settings::read_global,
+    verdict::{FORCE_WAKEUP, NO_WAKEUP, RING_AVAIL_DATA},
 };
 
 use super::{
@@ -26,74 +26,80 @@ use super::{
 };
 
 /// Maximum number of chunks of one packet, which cover 128 KB.
-const PARTS: u32 = 8;
-/// Flag that wakes user space. It is not a bit of [`part`].
-pub const WAKE: u32 = 1 << 16;
+const MAX_CHUNKS_PER_PACKET: u32 = 8;
+/// Flag that wakes user space. It is not a bit of [`chunk_flag`].
+pub const WAKEUP: u32 = 1 << 16;
 
 /// Loads the first bytes of the batch at `offset` of the payload into the window; returns their
 /// number.
 #[unsafe(export_name = "zenoh_load_window")]
 #[inline(never)]
 pub extern "C" fn load_window(skb: *mut __sk_buff, slot: u32, offset: u32) -> u32 {
-    let (Some(mut this), Some(mut buffer)) = (segment(slot), piece(slot)) else {
+    let (Some(mut this), Some(mut buffer)) = (segment(slot), piece_buffer(slot)) else {
         return 0;
     };
-    this.end = 0;
+    this.window_len = 0;
     let left = this.len.wrapping_sub(offset);
     let wanted = if left > WINDOW { WINDOW } else { left };
-    if wanted == 0 || !load(skb, &mut buffer, this.body.wrapping_add(offset), wanted) {
+    if wanted == 0 || !load_into_buffer(skb, &mut buffer, this.body.wrapping_add(offset), wanted) {
         return 0;
     }
     this.window = offset;
-    this.end = wanted;
+    this.window_len = wanted;
     wanted
 }
 
 #[inline(always)]
-fn load(skb: *mut __sk_buff, buffer: &mut PieceBuffer, from: u32, len: u32) -> bool {
+fn load_into_buffer(skb: *mut __sk_buff, buffer: &mut PieceBuffer, from: u32, len: u32) -> bool {
     // SAFETY: the buffer can hold the longest piece.
-    let loaded = unsafe {
+    let status = unsafe {
         bpf_skb_load_bytes(
             skb.cast(),
             from,
             buffer.bytes.as_mut_ptr().cast(),
-            bounded(len) as u32,
+            bounded_piece_len(len) as u32,
         )
     };
-    loaded == 0
+    status == 0
 }
 
 /// Passes on `len` bytes at `offset` of the payload, and copies all of them. `flags` are those of
 /// the first chunk.
 #[unsafe(export_name = "zenoh_whole")]
 #[inline(never)]
-pub extern "C" fn whole(skb: *mut __sk_buff, slot: u32, offset: u32, len: u32, flags: u32) -> u32 {
-    let (mut done, mut number, mut flags) = (0, 0, flags);
-    while number < PARTS {
-        if done >= len {
+pub extern "C" fn write_full_chunks(
+    skb: *mut __sk_buff,
+    slot: u32,
+    offset: u32,
+    len: u32,
+    flags: u32,
+) -> u32 {
+    let (mut written_len, mut chunk_count, mut flags) = (0, 0, flags);
+    while chunk_count < MAX_CHUNKS_PER_PACKET {
+        if written_len >= len {
             return 1;
         }
-        let left = len - done;
-        let now = if left > PIECE_BYTES {
+        let left = len - written_len;
+        let chunk_len = if left > PIECE_BYTES {
             PIECE_BYTES
         } else {
             left
         };
-        head(
+        write_chunk(
             skb,
             slot,
-            offset.wrapping_add(done),
-            u64::from(now) << 32 | u64::from(now),
+            offset.wrapping_add(written_len),
+            u64::from(chunk_len) << 32 | u64::from(chunk_len),
             flags,
         );
-        flags &= WAKE;
-        done += PIECE_BYTES;
-        number += 1;
+        flags &= WAKEUP;
+        written_len += PIECE_BYTES;
+        chunk_count += 1;
     }
-    if done < len
+    if written_len < len
         && let Some(mut this) = segment(slot)
     {
-        this.state.pending |= u32::from(part::LOST);
+        this.state.pending_flags |= u32::from(chunk_flag::LOST);
     }
     1
 }
@@ -102,56 +108,62 @@ pub extern "C" fn whole(skb: *mut __sk_buff, slot: u32, offset: u32, len: u32, f
 /// upper half the number of bytes that are copied.
 #[unsafe(export_name = "zenoh_head")]
 #[inline(never)]
-pub extern "C" fn head(
+pub extern "C" fn write_chunk(
     skb: *mut __sk_buff,
     slot: u32,
     offset: u32,
     lengths: u64,
     flags: u32,
 ) -> u32 {
-    let (Some(mut this), Some(mut buffer)) = (segment(slot), piece(slot)) else {
+    let (Some(mut this), Some(mut buffer)) = (segment(slot), piece_buffer(slot)) else {
         return 0;
     };
     let (len, copied) = (lengths as u32, (lengths >> 32) as u32);
-    if PIECES.query(AVAILABLE_DATA) > setting(&WAKE_PIECE_BYTES) / 2 * 3 {
+    if PIECES.query(RING_AVAIL_DATA) > read_global(&WAKE_PIECE_BYTES) / 2 * 3 {
         // The rest of the ring is reserved for datagrams.
-        return lost(slot);
+        return count_lost_chunk(slot);
     }
-    if copied != 0 && (offset != this.window || copied > this.end) {
-        this.end = 0;
-        if !load(skb, &mut buffer, this.body.wrapping_add(offset), copied) {
-            return lost(slot);
+    if copied != 0 && (offset != this.window || copied > this.window_len) {
+        this.window_len = 0;
+        if !load_into_buffer(skb, &mut buffer, this.body.wrapping_add(offset), copied) {
+            return count_lost_chunk(slot);
         }
     }
-    describe(&mut buffer.piece, &this, offset);
+    fill_chunk_header(&mut buffer.piece, &this, offset);
     let piece = &mut buffer.piece;
     piece.datagram_len = len;
     piece.len = copied;
-    piece.chunk |= (flags | this.state.pending) as u16;
-    let wake = if flags & WAKE != 0 || PIECES.query(AVAILABLE_DATA) > setting(&WAKE_PIECE_BYTES) {
-        FORCE_WAKEUP
-    } else {
-        NO_WAKEUP
-    };
-    let size = size_of::<Piece>() + if copied == 0 { 0 } else { bounded(copied) };
+    piece.chunk |= (flags | this.state.pending_flags) as u16;
+    let wake =
+        if flags & WAKEUP != 0 || PIECES.query(RING_AVAIL_DATA) > read_global(&WAKE_PIECE_BYTES) {
+            FORCE_WAKEUP
+        } else {
+            NO_WAKEUP
+        };
+    let size = size_of::<Piece>()
+        + if copied == 0 {
+            0
+        } else {
+            bounded_piece_len(copied)
+        };
     // SAFETY: the buffer is that long.
     let bytes = unsafe { core::slice::from_raw_parts((&raw const *buffer).cast::<u8>(), size) };
     let written = PIECES.output::<[u8]>(bytes, wake).is_ok();
     buffer.piece.chunk = 0;
     if !written {
-        return lost(slot);
+        return count_lost_chunk(slot);
     }
     if this.state.protocol == protocol::ZENOH {
         count(slot, Counter::ZenohChunks, 1);
     }
-    this.state.pending = 0;
-    this.state.reported = this.now;
+    this.state.pending_flags = 0;
+    this.state.last_chunk_ns = this.now;
     1
 }
 
 /// Writes the fields of a piece that all chunks have.
 #[inline(always)]
-fn describe(piece: &mut Piece, this: &Segment, offset: u32) {
+fn fill_chunk_header(piece: &mut Piece, this: &Segment, offset: u32) {
     piece.time = this.now;
     piece.socket = this.key.socket;
     piece.source = this.source;
@@ -173,7 +185,7 @@ fn describe(piece: &mut Piece, this: &Segment, offset: u32) {
     };
     piece.flags = flag::HOST | flag::STREAM | ipv6 | outgoing;
     piece.chunk = if this.state.protocol == protocol::RTPS {
-        part::RTPS
+        chunk_flag::RTPS
     } else {
         0
     };
@@ -183,15 +195,16 @@ fn describe(piece: &mut Piece, this: &Segment, offset: u32) {
 /// there is no link.
 #[unsafe(export_name = "zenoh_link")]
 #[inline(never)]
-pub extern "C" fn link(skb: *mut __sk_buff, slot: u32) -> u32 {
-    let (Some(mut this), Some(mut buffer)) = (segment(slot), piece(slot)) else {
+pub extern "C" fn write_link_state(skb: *mut __sk_buff, slot: u32) -> u32 {
+    let (Some(mut this), Some(mut buffer)) = (segment(slot), piece_buffer(slot)) else {
         return 0;
     };
-    let second = (this.now >> 30) as u32;
-    if this.key.outgoing != 1 || this.interface == LOOPBACK || this.state.linked == second {
+    let period = (this.now >> 30) as u32;
+    if this.key.outgoing != 1 || this.interface == LOOPBACK || this.state.last_link_report == period
+    {
         return 0;
     }
-    this.state.linked = second;
+    this.state.last_link_report = period;
     // SAFETY: the verifier rewrites reads of this field, and checks it against null.
     let socket = unsafe { (*skb).__bindgen_anon_2.sk };
     if socket.is_null() {
@@ -219,11 +232,11 @@ pub extern "C" fn link(skb: *mut __sk_buff, slot: u32) -> u32 {
         }
     };
     // The window holds no bytes of the segment any more.
-    this.end = 0;
-    describe(&mut buffer.piece, &this, 0);
+    this.window_len = 0;
+    fill_chunk_header(&mut buffer.piece, &this, 0);
     buffer.piece.datagram_len = 0;
     buffer.piece.len = size_of::<Link>() as u32;
-    buffer.piece.chunk |= part::LINK;
+    buffer.piece.chunk |= chunk_flag::LINK;
     // SAFETY: the buffer is longer than the state, and aligned.
     unsafe { buffer.bytes.as_mut_ptr().cast::<Link>().write(state) };
     let size = size_of::<Piece>() + size_of::<Link>();
@@ -235,7 +248,7 @@ pub extern "C" fn link(skb: *mut __sk_buff, slot: u32) -> u32 {
 }
 
 #[inline(always)]
-fn lost(slot: u32) -> u32 {
+fn count_lost_chunk(slot: u32) -> u32 {
     if let Some(mut this) = segment(slot) {
         let counter = if this.state.protocol == protocol::RTPS {
             Counter::TcpChunksLost
@@ -243,7 +256,7 @@ fn lost(slot: u32) -> u32 {
             Counter::ZenohChunksLost
         };
         count(slot, counter, 1);
-        this.state.pending |= u32::from(part::LOST);
+        this.state.pending_flags |= u32::from(chunk_flag::LOST);
     }
     0
 }

@@ -1,11 +1,18 @@
-//! Selects the bytes of Zenoh's TCP connections that user space needs.
+//! Selects the bytes of TCP connections of Zenoh and RTPS that user space needs.
 //!
-//! At the sockets ([`socket`]) each direction of a connection is followed from batch to batch. Only
-//! the head of a sample is passed on, but declarations as a whole. On interfaces ([`frame`]) whole
-//! frames are kept. At both hooks a connection is found by its first batch, or by batches with
-//! consecutive sequence numbers ([`search`]). Of QUIC connections only the first packets are
-//! recognized ([`quic`]). No byte of other connections is passed on, and few of their bytes are
-//! read.
+//! At both hooks a connection is recognized by its first batch or frame, or by batches with
+//! consecutive sequence numbers ([`search`]). At the sockets ([`process_socket_segment`]) each
+//! direction of such a connection is followed from batch to batch. Only the head of a sample is
+//! passed on, but declarations as a whole. On interfaces ([`filter_tcp_frame`]) whole frames are
+//! kept.
+//!
+//! The bytes of a connection that is not recognized stay in the kernel, except on configured ports
+//! of Zenoh:
+//!
+//! - At a socket, these bytes are passed on: the first 16 of a hello of TLS, and the first 512 of
+//!   an INIT of another version of Zenoh. Of each Initial packet of QUIC ([`quic`]), 6 bytes are.
+//! - On an interface, every TCP frame with payload, SYN, FIN or RST is kept as a whole, of any
+//!   protocol. So is every datagram with an Initial packet of QUIC.
 
 mod chunk;
 mod follow;
@@ -19,13 +26,13 @@ use aya_ebpf::{
     bindings::__sk_buff,
     helpers::{bpf_ktime_get_ns, generated::bpf_get_socket_cookie},
 };
-use ros2probe_wire::{host::chunk as part, quic as initial};
+use ros2probe_wire::{host::chunk as chunk_flag, quic as initial};
 
 use crate::{
-    host::meet,
-    maps::{claim_incoming, claim_outgoing, release, scratch},
-    packet::{IPV4_MAPPED, hook, load},
-    settings::setting,
+    host::add_socket,
+    maps::{claim_egress_slot, claim_ingress_slot, release_slot, scratch},
+    packet::{IPV4_MAPPED, hook, load_bytes},
+    settings::read_global,
 };
 use state::{CONNECTIONS, Key, Segment, ZENOH_PORTS};
 
@@ -47,24 +54,24 @@ struct Header {
     sequence_number: u32,
     flags: u32,
     /// Offset of the payload in the socket buffer.
-    body: u32,
+    payload_offset: u32,
     /// Length of the payload.
-    len: u32,
+    payload_len: u32,
 }
 
 /// Handles one packet at a socket; `at` is one of [`hook`].
 // Inlined, as other functions here, because the verifier allows at most eight nested calls.
 #[inline(always)]
-pub fn socket(skb: *mut __sk_buff, at: u32) -> Option<()> {
+pub fn process_socket_segment(skb: *mut __sk_buff, at: u32) -> Option<()> {
     // SAFETY: the verifier rewrites reads of this field.
     let interface = unsafe { (*skb).ifindex };
     // Of Zenoh, these bytes were captured at the socket of their sender.
-    let is_repeated = at != hook::EGRESS && interface == LOOPBACK;
-    if is_repeated && !state::is_any_rtps() {
+    let is_loopback_copy = at != hook::EGRESS && interface == LOOPBACK;
+    if is_loopback_copy && !state::is_any_rtps() {
         return None;
     }
-    let header = header(skb, 0)?;
-    if header.flags & SYN != 0 || header.len == 0 && header.flags & (FIN | RST) == 0 {
+    let header = parse_tcp_header(skb, 0)?;
+    if header.flags & SYN != 0 || header.payload_len == 0 && header.flags & (FIN | RST) == 0 {
         return None;
     }
     let outgoing = u32::from(at == hook::EGRESS);
@@ -74,88 +81,108 @@ pub fn socket(skb: *mut __sk_buff, at: u32) -> Option<()> {
         ports: header.source_port << 16 | header.destination_port,
         outgoing,
     };
-    let is_noted = state::is_noted(key.socket);
-    let known = match is_noted {
+    let is_tracked_socket = state::is_tracked_socket(key.socket);
+    let direction = match is_tracked_socket {
         true => CONNECTIONS.get_ptr_mut(&key),
         false => None,
     };
-    let is_known = known.is_some();
-    if is_repeated {
-        let is_rtps = match known {
+    let is_known = direction.is_some();
+    if is_loopback_copy {
+        let is_rtps = match direction {
             // SAFETY: a map value pointer checked against null.
-            Some(known) => unsafe { (*known).protocol == state::protocol::RTPS },
-            None => rtps::begins(skb, header.body, header.len),
+            Some(direction) => unsafe { (*direction).protocol == state::protocol::RTPS },
+            None => rtps::starts_frame(skb, header.payload_offset, header.payload_len),
         };
         if !is_rtps {
             return None;
         }
     }
     if is_known {
-        state::note(key.socket);
-    } else if !search::may_be(skb, header.body, header.len, &key, is_noted) {
+        state::track_socket(key.socket);
+    } else if !search::may_be_tracked_protocol(
+        skb,
+        header.payload_offset,
+        header.payload_len,
+        &key,
+        is_tracked_socket,
+    ) {
         return None;
     }
     let slot = if outgoing == 0 {
-        claim_incoming()?
+        claim_ingress_slot()?
     } else {
-        claim_outgoing()?
+        claim_egress_slot()?
     };
     if let Some(mut segment) = state::segment(slot) {
-        fill(skb, &mut segment, &header, &key);
+        init_segment(skb, &mut segment, &header, &key);
         if is_known {
-            follow::segment(skb, slot);
-        } else if search::at_socket(skb, slot) != 0 {
+            follow::forward_segment(skb, slot);
+        } else if search::probe_at_socket(skb, slot) != 0 {
             // This call happens once per direction, not per segment.
-            meet(skb, key.socket, 1);
-            follow::segment(skb, slot);
+            add_socket(skb, key.socket, 1);
+            follow::forward_segment(skb, slot);
         }
         if header.flags & (FIN | RST) != 0 {
-            follow::end(skb, slot, header.flags & RST);
+            follow::end_direction(skb, slot, header.flags & RST);
         }
     }
-    release(slot);
+    release_slot(slot);
     Some(())
 }
 
 /// Handles one frame on an interface; returns 1 to keep it. `slot` is claimed.
 #[unsafe(export_name = "zenoh_frame")]
 #[inline(never)]
-pub extern "C" fn frame(skb: *mut __sk_buff, slot: u32, start: u32) -> u32 {
-    u32::from(on_interface(skb, slot, start).is_some())
+pub extern "C" fn filter_tcp_frame(skb: *mut __sk_buff, slot: u32, start: u32) -> u32 {
+    u32::from(filter_interface_frame(skb, slot, start).is_some())
 }
 
 #[inline(always)]
-fn on_interface(skb: *mut __sk_buff, slot: u32, start: u32) -> Option<()> {
-    let header = header(skb, start)?;
-    if header.len == 0 && header.flags & (SYN | FIN | RST) == 0 {
+fn filter_interface_frame(skb: *mut __sk_buff, slot: u32, start: u32) -> Option<()> {
+    let header = parse_tcp_header(skb, start)?;
+    if header.payload_len == 0 && header.flags & (SYN | FIN | RST) == 0 {
         return None;
     }
-    if is_port(header.source_port) || is_port(header.destination_port) {
+    if is_configured_port(header.source_port) || is_configured_port(header.destination_port) {
         return Some(());
     }
     // SAFETY: the verifier rewrites reads of this field.
     let interface = unsafe { (*skb).ifindex };
-    let (one, other) = (&header.source, &header.destination);
-    let low = u64::from(one[3]) + u64::from(other[3]) + u64::from(one[1]) + u64::from(other[1]);
-    let high = u64::from(one[2]) + u64::from(other[2]) + u64::from(one[0]) + u64::from(other[0]);
+    let (source, destination) = (&header.source, &header.destination);
+    let low_hash = u64::from(source[3])
+        + u64::from(destination[3])
+        + u64::from(source[1])
+        + u64::from(destination[1]);
+    let high_hash = u64::from(source[2])
+        + u64::from(destination[2])
+        + u64::from(source[0])
+        + u64::from(destination[0]);
     let key = Key {
         // The hash is the same for both directions. If another connection has the same hash and
         // ports, its frames are kept, too.
-        socket: low.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ high << 20 ^ u64::from(interface),
+        socket: low_hash.wrapping_mul(0x9e37_79b9_7f4a_7c15)
+            ^ high_hash << 20
+            ^ u64::from(interface),
         ports: header.source_port << 16 | header.destination_port,
         outgoing: 2,
     };
-    let is_noted = state::is_noted(key.socket);
-    if is_noted && CONNECTIONS.get_ptr_mut(&key).is_some() {
-        state::note(key.socket);
+    let is_tracked_socket = state::is_tracked_socket(key.socket);
+    if is_tracked_socket && CONNECTIONS.get_ptr_mut(&key).is_some() {
+        state::track_socket(key.socket);
         return Some(());
     }
-    if !search::may_be(skb, header.body, header.len, &key, is_noted) {
+    if !search::may_be_tracked_protocol(
+        skb,
+        header.payload_offset,
+        header.payload_len,
+        &key,
+        is_tracked_socket,
+    ) {
         return None;
     }
     let mut segment = state::segment(slot)?;
-    fill(skb, &mut segment, &header, &key);
-    if search::on_interface(skb, slot) == 0 {
+    init_segment(skb, &mut segment, &header, &key);
+    if search::probe_on_interface(skb, slot) == 0 {
         return None;
     }
     Some(())
@@ -171,22 +198,22 @@ pub extern "C" fn quic(skb: *mut __sk_buff, slot: u32) -> u32 {
         return 0;
     };
     let packet = &scratch.get().packet;
-    let body = packet.body;
-    let Some(ports): Option<u32> = load(skb, body) else {
+    let body = packet.payload_offset;
+    let Some(ports): Option<u32> = load_bytes(skb, body) else {
         return 0;
     };
     let ports = u32::from_be(ports);
-    if !is_zenoh_port(ports) || packet.fragmented != 0 || packet.len < UDP_HEADER {
+    if !is_zenoh_port(ports) || packet.is_fragment != 0 || packet.len < UDP_HEADER {
         return 0;
     }
     let len = packet.len - UDP_HEADER;
-    let Some(head): Option<[u8; initial::HEAD]> = load(skb, body + UDP_HEADER) else {
+    let Some(head): Option<[u8; initial::HEAD]> = load_bytes(skb, body + UDP_HEADER) else {
         return 0;
     };
     if !initial::is_initial(head, len) {
         return 0;
     }
-    if packet.host == 0 {
+    if packet.is_at_socket == 0 {
         return 1;
     }
     if let Some(mut segment) = state::segment(slot) {
@@ -194,7 +221,7 @@ pub extern "C" fn quic(skb: *mut __sk_buff, slot: u32) -> u32 {
             // SAFETY: `skb` is the program's context.
             socket: unsafe { bpf_get_socket_cookie(skb.cast()) },
             ports,
-            outgoing: packet.outgoing,
+            outgoing: packet.is_outgoing,
         };
         segment.source = packet.source;
         segment.destination = packet.destination;
@@ -204,13 +231,19 @@ pub extern "C" fn quic(skb: *mut __sk_buff, slot: u32) -> u32 {
         segment.sequence_number = 0;
         segment.body = body + UDP_HEADER;
         segment.len = len;
-        segment.end = 0;
-        segment.state.pending = 0;
+        segment.window_len = 0;
+        segment.state.pending_flags = 0;
         segment.state.protocol = state::protocol::ZENOH;
         // SAFETY: no preconditions.
         segment.now = unsafe { bpf_ktime_get_ns() };
         let lengths = (initial::HEAD as u64) << 32 | u64::from(len);
-        chunk::head(skb, slot, 0, lengths, u32::from(part::QUIC) | chunk::WAKE);
+        chunk::write_chunk(
+            skb,
+            slot,
+            0,
+            lengths,
+            u32::from(chunk_flag::QUIC) | chunk::WAKEUP,
+        );
     }
     0
 }
@@ -218,13 +251,13 @@ pub extern "C" fn quic(skb: *mut __sk_buff, slot: u32) -> u32 {
 /// Returns whether one of two ports is configured as a port of Zenoh.
 #[inline(always)]
 pub fn is_zenoh_port(ports: u32) -> bool {
-    is_port(ports >> 16) || is_port(ports & 0xffff)
+    is_configured_port(ports >> 16) || is_configured_port(ports & 0xffff)
 }
 
 /// Returns whether the port is configured as a port of Zenoh.
 #[inline(always)]
-fn is_port(port: u32) -> bool {
-    let ports = setting(&ZENOH_PORTS);
+fn is_configured_port(port: u32) -> bool {
+    let ports = read_global(&ZENOH_PORTS);
     let port = port as u16;
     ports[0] == port
         || ports[1] == port
@@ -237,17 +270,17 @@ fn is_port(port: u32) -> bool {
 }
 
 #[inline(always)]
-fn fill(skb: *mut __sk_buff, segment: &mut Segment, header: &Header, key: &Key) {
+fn init_segment(skb: *mut __sk_buff, segment: &mut Segment, header: &Header, key: &Key) {
     segment.key = *key;
     segment.source = header.source;
     segment.destination = header.destination;
     segment.source_port = header.source_port;
     segment.destination_port = header.destination_port;
     segment.sequence_number = header.sequence_number;
-    segment.body = header.body;
-    segment.len = header.len;
+    segment.body = header.payload_offset;
+    segment.len = header.payload_len;
     // The window holds another packet's bytes.
-    segment.end = 0;
+    segment.window_len = 0;
     // SAFETY: the verifier rewrites reads of this field.
     segment.interface = unsafe { (*skb).ifindex };
     // SAFETY: no preconditions.
@@ -257,8 +290,8 @@ fn fill(skb: *mut __sk_buff, segment: &mut Segment, header: &Header, key: &Key) 
 /// Reads the headers; `None` if the packet is not a TCP segment in one piece. IPv6 extension
 /// headers are not read, because no TCP stack sends them by default.
 #[inline(always)]
-fn header(skb: *mut __sk_buff, start: u32) -> Option<Header> {
-    let first: [u32; 5] = load(skb, start)?;
+fn parse_tcp_header(skb: *mut __sk_buff, start: u32) -> Option<Header> {
+    let first: [u32; 5] = load_bytes(skb, start)?;
     let (body, total, source, destination) = match u32::from_be(first[0]) >> 28 {
         4 => {
             let lengths = u32::from_be(first[0]);
@@ -280,7 +313,7 @@ fn header(skb: *mut __sk_buff, start: u32) -> Option<Header> {
             if u32::from_be(first[1]) >> 8 & 0xff != TCP {
                 return None;
             }
-            let rest: [u32; 5] = load(skb, start + 20)?;
+            let rest: [u32; 5] = load_bytes(skb, start + 20)?;
             let payload = u32::from_be(first[1]) >> 16;
             (
                 start + 40,
@@ -291,7 +324,7 @@ fn header(skb: *mut __sk_buff, start: u32) -> Option<Header> {
         }
         _ => return None,
     };
-    let tcp: [u32; 4] = load(skb, body)?;
+    let tcp: [u32; 4] = load_bytes(skb, body)?;
     // A packet of more than 64 KB has no length in its header.
     // SAFETY: the verifier rewrites reads of this field.
     let end = start
@@ -312,7 +345,7 @@ fn header(skb: *mut __sk_buff, start: u32) -> Option<Header> {
         destination_port: u32::from_be(tcp[0]) & 0xffff,
         sequence_number: u32::from_be(tcp[1]),
         flags: flags >> 16 & 0x3f,
-        body,
-        len: end - body,
+        payload_offset: body,
+        payload_len: end - body,
     })
 }

@@ -8,46 +8,52 @@
 use aya_ebpf::bindings::__sk_buff;
 use ros2probe_wire::{
     filter::Counter,
-    host::chunk as part,
+    host::chunk as chunk_flag,
     zenoh_stream::{Beginning, HEAD, Lanes, PREFIX},
 };
 
 use crate::{
-    maps::{Working, copy, count},
-    packet::load,
+    maps::{ScratchRef, copy, count},
+    packet::load_bytes,
 };
 
 use super::{
-    chunk::{self, WAKE},
+    chunk::{self, WAKEUP},
     is_zenoh_port, message, rtps,
     state::{
-        CANDIDATES, CONNECTIONS, Direction, Key, Segment, Window, body, found_rtps, mode, note,
-        protocol, segment,
+        CANDIDATES, CONNECTIONS, Direction, Key, Segment, Window, body, found_rtps, mode, protocol,
+        segment, track_socket,
     },
 };
 
 /// Maximum number of batches of one packet that the search reads.
-const BATCHES: u32 = 32;
+const MAX_BATCHES: u32 = 32;
 /// Number of bytes of TLS that are passed on, once per direction.
 const TLS_BYTES: u32 = 16;
 
 /// Returns whether the payload may belong to a connection of Zenoh that is not known yet.
 #[inline(always)]
-pub fn may_be(skb: *mut __sk_buff, body: u32, len: u32, key: &Key, is_noted: bool) -> bool {
+pub fn may_be_tracked_protocol(
+    skb: *mut __sk_buff,
+    body: u32,
+    len: u32,
+    key: &Key,
+    is_tracked_socket: bool,
+) -> bool {
     len != 0
-        && (begins_with(skb, body, len, key.ports) != Beginning::Other
-            || is_noted && CANDIDATES.get_ptr_mut(key).is_some())
+        && (classify_payload(skb, body, len, key.ports) != Beginning::Other
+            || is_tracked_socket && CANDIDATES.get_ptr_mut(key).is_some())
 }
 
 /// Classifies the start of a payload.
 #[inline(always)]
-fn begins_with(skb: *mut __sk_buff, at: u32, len: u32, ports: u32) -> Beginning {
+fn classify_payload(skb: *mut __sk_buff, at: u32, len: u32, ports: u32) -> Beginning {
     if len >= HEAD as u32 {
-        if let Some(head) = load(skb, at) {
+        if let Some(head) = load_bytes(skb, at) {
             return Beginning::of(head, len, is_zenoh_port(ports));
         }
     } else if len == 3
-        && let Some(bytes) = load(skb, at)
+        && let Some(bytes) = load_bytes(skb, at)
     {
         return Beginning::of_three(bytes);
     }
@@ -58,125 +64,130 @@ fn begins_with(skb: *mut __sk_buff, at: u32, len: u32, ports: u32) -> Beginning 
 /// segment must be followed.
 #[unsafe(export_name = "zenoh_at_socket")]
 #[inline(never)]
-pub extern "C" fn at_socket(skb: *mut __sk_buff, slot: u32) -> u32 {
+pub extern "C" fn probe_at_socket(skb: *mut __sk_buff, slot: u32) -> u32 {
     let Some(mut this) = segment(slot) else {
         return 0;
     };
-    let begins = begins_with(skb, this.body, this.len, this.key.ports);
-    match begins {
+    let payload_start = classify_payload(skb, this.body, this.len, this.key.ports);
+    match payload_start {
         Beginning::Init => {
-            begin(slot, u32::from(part::SYN));
-            know(slot, this, mode::FOLLOWED)
+            init_direction(slot, u32::from(chunk_flag::SYN));
+            insert_direction(slot, this, mode::SYNCHRONIZED)
         }
         Beginning::KeepAlive => {
-            begin(slot, u32::from(part::LOST));
-            know(slot, this, mode::FOLLOWED)
+            init_direction(slot, u32::from(chunk_flag::LOST));
+            insert_direction(slot, this, mode::SYNCHRONIZED)
         }
         Beginning::Frame => {
-            if !rtps::begins(skb, this.body, this.len) {
+            if !rtps::starts_frame(skb, this.body, this.len) {
                 return 0;
             }
-            begin(slot, u32::from(part::LOST));
+            init_direction(slot, u32::from(chunk_flag::LOST));
             this.state.protocol = protocol::RTPS;
             found_rtps();
-            know(slot, this, mode::FOLLOWED)
+            insert_direction(slot, this, mode::SYNCHRONIZED)
         }
         Beginning::OtherVersion | Beginning::Tls => {
-            begin(slot, u32::from(part::SYN));
-            let all = if begins == Beginning::Tls {
+            init_direction(slot, u32::from(chunk_flag::SYN));
+            let full_len = if payload_start == Beginning::Tls {
                 TLS_BYTES
             } else {
                 this.len
             };
-            let copied = if all > this.len { this.len } else { all };
+            let copied = if full_len > this.len {
+                this.len
+            } else {
+                full_len
+            };
             let copied = if copied > super::state::WINDOW {
                 super::state::WINDOW
             } else {
                 copied
             };
             let lengths = u64::from(copied) << 32 | u64::from(this.len);
-            chunk::head(skb, slot, 0, lengths, WAKE);
-            know(slot, this, mode::UNREADABLE);
+            chunk::write_chunk(skb, slot, 0, lengths, WAKEUP);
+            insert_direction(slot, this, mode::UNREADABLE);
             0
         }
         _ => {
-            if guess(skb, slot) == 0 {
+            if extend_candidate(skb, slot) == 0 {
                 return 0;
             }
-            this.state.boundary = this.state.guess.boundary;
-            this.state.covered = this.state.boundary;
-            know(slot, this, mode::FOLLOWED)
+            this.state.next_batch_seq = this.state.candidate.next_batch_seq;
+            this.state.forwarded_seq = this.state.next_batch_seq;
+            insert_direction(slot, this, mode::SYNCHRONIZED)
         }
     }
 }
 
-/// Searches as [`at_socket`] does, on an interface. Returns 1 if the connection is of Zenoh.
+/// Searches as [`probe_at_socket`] does, on an interface. Returns 1 if the connection carries Zenoh
+/// or RTPS.
 #[unsafe(export_name = "zenoh_on_interface")]
 #[inline(never)]
-pub extern "C" fn on_interface(skb: *mut __sk_buff, slot: u32) -> u32 {
+pub extern "C" fn probe_on_interface(skb: *mut __sk_buff, slot: u32) -> u32 {
     let Some(mut this) = segment(slot) else {
         return 0;
     };
-    let begins = begins_with(skb, this.body, this.len, this.key.ports);
-    let is_certain = match begins {
+    let payload_start = classify_payload(skb, this.body, this.len, this.key.ports);
+    let is_certain = match payload_start {
         Beginning::Init | Beginning::KeepAlive => true,
-        Beginning::Frame => rtps::begins(skb, this.body, this.len),
-        _ => guess(skb, slot) != 0,
+        Beginning::Frame => rtps::starts_frame(skb, this.body, this.len),
+        _ => extend_candidate(skb, slot) != 0,
     };
     if !is_certain {
         return 0;
     }
-    begin(slot, 0);
-    if begins == Beginning::Frame {
+    init_direction(slot, 0);
+    if payload_start == Beginning::Frame {
         this.state.protocol = protocol::RTPS;
     }
-    know(slot, this, mode::UNREADABLE);
+    insert_direction(slot, this, mode::UNREADABLE);
     this.key.ports = this.key.ports << 16 | this.key.ports >> 16;
-    know(slot, this, mode::UNREADABLE);
+    insert_direction(slot, this, mode::UNREADABLE);
     1
 }
 
 /// Starts a direction with the current segment.
 #[unsafe(export_name = "zenoh_begin")]
 #[inline(never)]
-extern "C" fn begin(slot: u32, pending: u32) -> u32 {
+extern "C" fn init_direction(slot: u32, pending: u32) -> u32 {
     let Some(mut this) = segment(slot) else {
         return 0;
     };
-    this.state.reported = 0;
-    this.state.next = this.sequence_number;
-    this.state.boundary = this.sequence_number;
-    this.state.covered = this.sequence_number;
+    this.state.last_chunk_ns = 0;
+    this.state.next_seq = this.sequence_number;
+    this.state.next_batch_seq = this.sequence_number;
+    this.state.forwarded_seq = this.sequence_number;
     this.state.body = body::SKIPPED;
-    this.state.chain = 0;
-    this.state.prefix = 0;
-    this.state.pending = pending;
+    this.state.fragment_state = 0;
+    this.state.split_prefix = 0;
+    this.state.pending_flags = pending;
     this.state.gap_bytes = 0;
-    this.state.hole_len = 0;
+    this.state.gap_len = 0;
     this.state.protocol = protocol::ZENOH;
-    this.state.length = 0;
-    this.state.linked = 0;
-    close(slot)
+    this.state.partial_length = 0;
+    this.state.last_link_report = 0;
+    reset_candidate(slot)
 }
 
-/// Discards the guess about the direction.
+/// Discards the candidate of the direction.
 #[unsafe(export_name = "zenoh_forget")]
 #[inline(never)]
-extern "C" fn close(slot: u32) -> u32 {
+extern "C" fn reset_candidate(slot: u32) -> u32 {
     let Some(mut this) = segment(slot) else {
         return 0;
     };
     let number = this.sequence_number;
-    let guess = &mut this.state.guess;
-    guess.boundary = number;
-    guess.next = number;
-    guess.is_open = 0;
-    guess.lanes = Lanes::new();
+    let candidate = &mut this.state.candidate;
+    candidate.next_batch_seq = number;
+    candidate.next_seq = number;
+    candidate.is_valid = 0;
+    candidate.lanes = Lanes::new();
     0
 }
 
 #[inline(always)]
-fn know(slot: u32, mut this: Working<Segment>, mode: u32) -> u32 {
+fn insert_direction(slot: u32, mut this: ScratchRef<Segment>, mode: u32) -> u32 {
     this.state.mode = mode;
     let counter = if this.state.protocol == protocol::RTPS {
         Counter::TcpConnections
@@ -184,25 +195,25 @@ fn know(slot: u32, mut this: Working<Segment>, mode: u32) -> u32 {
         Counter::ZenohConnections
     };
     count(slot, counter, 1);
-    note(this.key.socket);
+    track_socket(this.key.socket);
     u32::from(CONNECTIONS.insert(&this.key, &this.state, 0).is_ok())
 }
 
-/// Continues the guess about the direction, or begins one. Returns 1 once the boundary is certain.
+/// Extends the candidate of the direction, or begins one. Returns 1 once the boundary is certain.
 #[inline(always)]
-fn guess(skb: *mut __sk_buff, slot: u32) -> u32 {
+fn extend_candidate(skb: *mut __sk_buff, slot: u32) -> u32 {
     let Some(mut this) = segment(slot) else {
         return 0;
     };
     let known = CANDIDATES.get_ptr_mut(&this.key);
-    begin(slot, u32::from(part::LOST));
+    init_direction(slot, u32::from(chunk_flag::LOST));
     if let Some(known) = known {
         // SAFETY: a map value pointer checked against null.
         let known: &Direction = unsafe { &*known };
-        copy(&known.guess, &mut this.state.guess);
+        copy(&known.candidate, &mut this.state.candidate);
     }
-    let is_certain = judge(skb, slot, 0);
-    if is_certain != 0 || this.state.guess.is_open == 0 {
+    let is_certain = validate_batches(skb, slot, 0);
+    if is_certain != 0 || this.state.candidate.is_valid == 0 {
         if known.is_some() {
             let _ = CANDIDATES.remove(&this.key);
         }
@@ -211,48 +222,56 @@ fn guess(skb: *mut __sk_buff, slot: u32) -> u32 {
     if known.is_none() {
         count(slot, Counter::ZenohCandidates, 1);
     }
-    note(this.key.socket);
+    track_socket(this.key.socket);
     let _ = CANDIDATES.insert(&this.key, &this.state, 0);
     0
 }
 
 /// Reads the batches of the segment as long as each continues the earlier ones. Returns 1 as soon
-/// as the boundary is certain; with `to_end`, all batches up to the end of the segment must also
-/// fit.
+/// as the boundary is certain; with `must_reach_end`, all batches up to the end of the segment must
+/// also fit.
 #[unsafe(export_name = "zenoh_judge")]
 #[inline(never)]
-pub extern "C" fn judge(skb: *mut __sk_buff, slot: u32, to_end: u32) -> u32 {
+pub extern "C" fn validate_batches(skb: *mut __sk_buff, slot: u32, must_reach_end: u32) -> u32 {
     let Some(mut this) = segment(slot) else {
         return 0;
     };
-    if this.state.guess.is_open == 0 || this.state.guess.next != this.sequence_number {
-        close(slot);
-        this.state.guess.is_open = 1;
+    if this.state.candidate.is_valid == 0 || this.state.candidate.next_seq != this.sequence_number {
+        reset_candidate(slot);
+        this.state.candidate.is_valid = 1;
     }
     let mut batches = 0;
-    while batches < BATCHES {
-        let offset = this.state.guess.boundary.wrapping_sub(this.sequence_number);
+    while batches < MAX_BATCHES {
+        let offset = this
+            .state
+            .candidate
+            .next_batch_seq
+            .wrapping_sub(this.sequence_number);
         if offset >= this.len {
-            this.state.guess.next = this.sequence_number.wrapping_add(this.len);
-            return u32::from(this.state.guess.lanes.are_certain());
+            this.state.candidate.next_seq = this.sequence_number.wrapping_add(this.len);
+            return u32::from(this.state.candidate.lanes.are_certain());
         }
-        if fits(skb, slot, offset) == 0 {
+        if validate_batch(skb, slot, offset) == 0 {
             break;
         }
-        if to_end == 0 && this.state.guess.lanes.are_certain() {
+        if must_reach_end == 0 && this.state.candidate.lanes.are_certain() {
             return 1;
         }
-        this.state.guess.boundary = this.state.guess.boundary.wrapping_add(this.total);
+        this.state.candidate.next_batch_seq = this
+            .state
+            .candidate
+            .next_batch_seq
+            .wrapping_add(this.batch_len);
         batches += 1;
     }
-    this.state.guess.is_open = 0;
+    this.state.candidate.is_valid = 0;
     0
 }
 
 /// Returns 1 if the batch at this offset continues the earlier ones.
 #[unsafe(export_name = "zenoh_fits")]
 #[inline(never)]
-extern "C" fn fits(skb: *mut __sk_buff, slot: u32, offset: u32) -> u32 {
+extern "C" fn validate_batch(skb: *mut __sk_buff, slot: u32, offset: u32) -> u32 {
     let (Some(mut this), Some(window)) = (segment(slot), Window::of(slot)) else {
         return 0;
     };
@@ -260,16 +279,16 @@ extern "C" fn fits(skb: *mut __sk_buff, slot: u32, offset: u32) -> u32 {
     let (Some(low), Some(high)) = (window.byte(0, read), window.byte(1, read)) else {
         return 0;
     };
-    this.total = (low | high << 8) + PREFIX;
-    if this.end > this.total {
-        this.end = this.total;
+    this.batch_len = (low | high << 8) + PREFIX;
+    if this.window_len > this.batch_len {
+        this.window_len = this.batch_len;
     }
-    this.is_judged = 1;
-    if this.total == PREFIX || message::read(slot) == 0 || !message::is_plausible(slot) {
+    this.is_probe = 1;
+    if this.batch_len == PREFIX || message::plan_batch(slot) == 0 || !message::is_plausible(slot) {
         return 0;
     }
-    let (lane, number) = (this.lane, this.number);
-    let lanes = &mut this.state.guess.lanes;
+    let (lane, number) = (this.lane, this.lane_sequence_number);
+    let lanes = &mut this.state.candidate.lanes;
     if lane == 0 {
         lanes.keep_alive();
         return 1;

@@ -1,4 +1,4 @@
-//! Maps of the connections of Zenoh, and the working memory of a run.
+//! Maps of the TCP connections of Zenoh and RTPS, and the working memory of a run.
 
 use aya_ebpf::{
     helpers::generated::bpf_jiffies64,
@@ -11,8 +11,8 @@ use ros2probe_wire::{
 };
 
 use crate::{
-    instructions::opaque,
-    maps::{SLOTS, Shared, Working, piece},
+    instructions::hide_bounds,
+    maps::{SCRATCH_SLOTS, ScratchRef, Shared, piece_buffer},
 };
 
 /// Maximum number of bytes of a batch that are read: enough for all headers of a sample, and a
@@ -23,7 +23,7 @@ pub const WINDOW: u32 = 512;
 #[unsafe(no_mangle)]
 pub static ZENOH_PORTS: [u16; PORT_CAPACITY] = [7447, 0, 0, 0, 0, 0, 0, 0];
 
-/// Directions of connections of Zenoh.
+/// Directions of recognized TCP connections: of Zenoh, of RTPS, and of TLS on a port of Zenoh.
 #[map]
 pub static CONNECTIONS: LruHashMap<Key, Direction> =
     LruHashMap::with_max_entries(CONNECTION_CAPACITY, 0);
@@ -45,14 +45,14 @@ const NOTED_JIFFIES: u32 = 600_000;
 static ANY_RTPS: Array<Shared<u32>> = Array::with_max_entries(1, 0);
 /// The current segment, by slot.
 #[map]
-static SEGMENT: PerCpuArray<Segment> = PerCpuArray::with_max_entries(SLOTS, 0);
+static SEGMENT: PerCpuArray<Segment> = PerCpuArray::with_max_entries(SCRATCH_SLOTS, 0);
 
 /// How a direction is read.
 pub mod mode {
     /// The boundaries of batches are known.
-    pub const FOLLOWED: u32 = 0;
+    pub const SYNCHRONIZED: u32 = 0;
     /// A boundary was lost: all bytes are passed on until it is found again.
-    pub const GAP: u32 = 1;
+    pub const RESYNCHRONIZING: u32 = 1;
     /// No batch of the direction can be read.
     pub const UNREADABLE: u32 = 2;
 }
@@ -74,8 +74,8 @@ pub mod body {
     pub const SKIPPED: u32 = 2;
 }
 
-/// Bits of [`Direction::chain`].
-pub mod chain {
+/// Bits of [`Direction::fragment_state`].
+pub mod fragment_state {
     /// The last FRAGMENT has a successor.
     pub const OPEN: u32 = 1;
     /// All fragments of the message are passed on whole.
@@ -102,13 +102,13 @@ pub struct Key {
 // Aligned, so that it is copied in few steps: the stack is small.
 #[repr(C, align(8))]
 #[derive(Clone, Copy)]
-pub struct Guess {
+pub struct SyncCandidate {
     /// Sequence number of the next batch.
-    pub boundary: u32,
+    pub next_batch_seq: u32,
     /// Sequence number of the next byte.
-    pub next: u32,
+    pub next_seq: u32,
     /// Whether the other fields are valid.
-    pub is_open: u32,
+    pub is_valid: u32,
     /// Sequence numbers of the lanes of the batches.
     pub lanes: Lanes,
 }
@@ -118,38 +118,38 @@ pub struct Guess {
 #[derive(Clone, Copy)]
 pub struct Direction {
     /// Time at which a chunk was last written.
-    pub reported: u64,
+    pub last_chunk_ns: u64,
     /// One of [`mode`].
     pub mode: u32,
     /// Sequence number of the next byte.
-    pub next: u32,
+    pub next_seq: u32,
     /// Sequence number of the next batch.
-    pub boundary: u32,
+    pub next_batch_seq: u32,
     /// Sequence number after the last byte that a chunk covers.
-    pub covered: u32,
+    pub forwarded_seq: u32,
     /// The part of the current batch that is passed on, one of [`body`].
     pub body: u32,
-    /// Bits of [`chain`].
-    pub chain: u32,
+    /// Bits of [`fragment_state`].
+    pub fragment_state: u32,
     /// Of Zenoh the first byte of a length, with bit 8 set, if the last segment ended after it. Of
     /// RTPS the number of bytes of a header at whose middle the last segment ended.
-    pub prefix: u32,
+    pub split_prefix: u32,
     /// Flags of the next chunk.
-    pub pending: u32,
+    pub pending_flags: u32,
     /// Bytes passed on since a boundary was lost.
     pub gap_bytes: u32,
     /// Sequence number of the first byte that was missing when the boundary was lost.
-    pub hole: u32,
-    /// Number of missing bytes that begin at `hole`, which TCP may retransmit.
-    pub hole_len: u32,
+    pub gap_start_seq: u32,
+    /// Number of missing bytes that begin at `gap_start_seq`, which TCP may retransmit.
+    pub gap_len: u32,
     /// One of [`protocol`].
     pub protocol: u32,
-    /// Of RTPS, the bytes of a frame's length that the last segment had, if `prefix` is set. Otherwise
-    /// the number of bytes of the frame's head that it did not have.
-    pub length: u32,
+    /// Of RTPS, the bytes of a frame's length that the last segment had, if `split_prefix` is set.
+    /// Otherwise the number of bytes of the frame's head that it did not have.
+    pub partial_length: u32,
     /// Time at which the connection's state was last passed on, in units of 2^30 nanoseconds.
-    pub linked: u32,
-    pub guess: Guess,
+    pub last_link_report: u32,
+    pub candidate: SyncCandidate,
 }
 
 /// The current TCP segment, and the values read from its current batch.
@@ -170,13 +170,13 @@ pub struct Segment {
     /// Length of the payload.
     pub len: u32,
     /// Position of the reader in the window.
-    pub at: u32,
+    pub position: u32,
     /// Bytes in the window.
-    pub end: u32,
+    pub window_len: u32,
     /// Offset in the payload of the window's first byte.
     pub window: u32,
     /// The number that was read last.
-    pub value: u32,
+    pub varint: u32,
     /// Position after the header of a FRAME or FRAGMENT.
     pub message: u32,
     /// Values of the extensions.
@@ -194,19 +194,19 @@ pub struct Segment {
     /// Length of that payload.
     pub payload_len: u32,
     /// Length of the current batch with its prefix.
-    pub total: u32,
+    pub batch_len: u32,
     /// Whether the batch is only examined, so that its sample does not matter.
-    pub is_judged: u32,
+    pub is_probe: u32,
     /// Whether user space should read the batch soon.
-    pub wakes: u32,
+    pub wakes_reader: u32,
     /// Number of bytes of the batch to pass on; `u32::MAX` = all.
-    pub wanted: u32,
+    pub forward_len: u32,
     /// Whether no byte is wanted because the budget of unknown publishers was spent.
     pub is_over_budget: u32,
     /// Key of the batch's lane; 0 = the batch has no lane.
     pub lane: u32,
     /// Sequence number in the lane.
-    pub number: u32,
+    pub lane_sequence_number: u32,
 }
 
 /// Returns whether a connection of RTPS was found on this host.
@@ -228,8 +228,8 @@ pub fn found_rtps() {
 
 /// Returns whether a socket may be in one of the tables.
 #[inline(always)]
-pub fn is_noted(socket: u64) -> bool {
-    let Some(at) = NOTED.get(noted_index(socket)) else {
+pub fn is_tracked_socket(socket: u64) -> bool {
+    let Some(at) = NOTED.get(tracked_socket_index(socket)) else {
         return false;
     };
     // SAFETY: no preconditions.
@@ -239,22 +239,22 @@ pub fn is_noted(socket: u64) -> bool {
 
 /// Notes that a socket is in one of the tables.
 #[inline(always)]
-pub fn note(socket: u64) {
-    if let Some(at) = NOTED.get(noted_index(socket)) {
+pub fn track_socket(socket: u64) {
+    if let Some(at) = NOTED.get(tracked_socket_index(socket)) {
         // SAFETY: no preconditions.
         at.set(unsafe { bpf_jiffies64() } as u32 | 1);
     }
 }
 
 #[inline(always)]
-fn noted_index(socket: u64) -> u32 {
+fn tracked_socket_index(socket: u64) -> u32 {
     (socket ^ socket >> 14 ^ socket >> 28) as u32 & (NOTED_ENTRIES - 1)
 }
 
 /// Returns the working memory of a slot.
 #[inline(always)]
-pub fn segment(slot: u32) -> Option<Working<Segment>> {
-    Working::of(&SEGMENT, slot)
+pub fn segment(slot: u32) -> Option<ScratchRef<Segment>> {
+    ScratchRef::lookup(&SEGMENT, slot)
 }
 
 /// The first bytes of the current batch, in a piece's buffer.
@@ -265,16 +265,16 @@ impl Window {
     /// Returns the window of a slot.
     #[inline(always)]
     pub fn of(slot: u32) -> Option<Self> {
-        piece(slot).map(|buffer| Self(buffer.bytes.as_ptr()))
+        piece_buffer(slot).map(|buffer| Self(buffer.bytes.as_ptr()))
     }
 
-    /// Returns the byte at `at`; `None` at `end` and after it.
+    /// Returns the byte at `at`; `None` if `at` is not below `end`.
     #[inline(always)]
     pub fn byte(self, at: u32, end: u32) -> Option<u32> {
         if at >= end || at >= WINDOW {
             return None;
         }
-        let at = opaque(at) as usize & (WINDOW as usize - 1);
+        let at = hide_bounds(at) as usize & (WINDOW as usize - 1);
         // SAFETY: the buffer is longer than the window.
         Some(u32::from(unsafe { *self.0.add(at) }))
     }
@@ -282,7 +282,7 @@ impl Window {
     /// Returns the four words at `at`.
     #[inline(always)]
     pub fn words(self, at: u32) -> [u32; 4] {
-        let at = opaque(at) as usize & (WINDOW as usize - 1);
+        let at = hide_bounds(at) as usize & (WINDOW as usize - 1);
         // SAFETY: the buffer is longer than the window and these words; this machine reads words at
         // any address.
         unsafe { *self.0.add(at).cast() }

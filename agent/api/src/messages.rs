@@ -77,7 +77,7 @@ pub struct Message<V> {
     pub preview_error: Option<String>,
 }
 
-/// A small picture of a message: an object with one member.
+/// A preview of a message: a JSON object with one member.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = MessagesPreview))]
 #[serde(rename_all = "snake_case")]

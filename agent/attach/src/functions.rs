@@ -18,7 +18,7 @@ pub const ENQUEUE: &str = "rclcpp_ring_buffer_enqueue";
 /// Program at `callback_start` if only messages are observed and the library lacks [`ENQUEUE`].
 const RECEPTION_PROGRAM: (&str, &str) = ("callback_received", "callback_start");
 
-/// Functions of messages, with programs of the same name.
+/// Observed functions that handle messages. Each has a program of the same name.
 const MESSAGES: [&str; 14] = [
     "rcl_publish",
     "rmw_take",

@@ -195,7 +195,7 @@ pub(crate) unsafe fn fork() -> io::Result<Option<Pid>> {
     }
 }
 
-/// Ends a child process immediately, without the exit handlers that it has from its parent.
+/// Ends the forked child at once, without the exit handlers inherited from its parent.
 pub(crate) fn end_fork(code: i32) -> ! {
     // SAFETY: the call runs no code of this process.
     unsafe { libc::_exit(code) }

@@ -23,7 +23,7 @@ pub const MAX_PROCESSES: usize = 1024;
 pub const MAX_DESCRIPTORS: usize = 253;
 /// Time in which a request is answered. A fork that needs longer is killed.
 pub const REQUEST_TIMEOUT: Duration = Duration::from_secs(4);
-/// Time in which a request for an environment is answered. An environment is short.
+/// Timeout of a request for a process's environment, which is short.
 const ENVIRONMENT_TIMEOUT: Duration = Duration::from_millis(500);
 
 /// A request with its number, which its answers repeat.

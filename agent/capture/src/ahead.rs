@@ -13,7 +13,8 @@ use ros2probe_wire::record::{Body, Record, flag};
 use super::reassembly::Reassembled;
 use crate::tables::{AheadBytes, AheadDatagrams, AheadRecords};
 
-/// By default, Linux gives up a fragmented datagram after 30 seconds (`ipfrag_time`).
+/// Time after which an incomplete datagram is discarded. By default, Linux waits as long for
+/// fragments of IPv4 (`ipfrag_time`), and twice as long for those of IPv6 (`ip6frag_time`).
 const LIFETIME_NANOSECONDS: i64 = 30_000_000_000;
 
 /// A complete item for the model.

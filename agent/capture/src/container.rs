@@ -17,7 +17,7 @@ const CONTAINER_ENGINES: [&str; 3] = ["docker", "oci", "podman"];
 pub const CGROUP_OPTIONS: &str = "--cgroupns host --volume /sys/fs/cgroup:/sys/fs/cgroup:ro";
 /// Address families of sockets at interfaces, as a line of a unit.
 pub const FAMILIES_LINE: &str = "RestrictAddressFamilies=AF_PACKET AF_NETLINK";
-/// Option for a profile that permits the BPF calls.
+/// Container option for a seccomp profile that permits `bpf(2)`.
 pub const SECCOMP_OPTION: &str = "--security-opt seccomp=FILE (docs/containers.md)";
 
 /// Inodes of the host's namespaces, the same on every kernel (include/linux/proc_ns.h).

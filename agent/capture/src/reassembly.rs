@@ -2,8 +2,8 @@
 //!
 //! Memory is allocated for bytes that have arrived, never for a length in a header. Flows and bytes
 //! are capped, and the oldest flow is evicted first. A finished datagram is remembered for a while,
-//! so that a duplicate fragment does not open it again. Fragments wait as long as in the receiving
-//! kernel by default (`ipfrag_time`).
+//! so that a duplicate fragment does not open it again. By default, fragments wait 30 s, as those
+//! of IPv4 do in the receiving kernel (`ipfrag_time`). It keeps fragments of IPv6 for 60 s.
 //!
 //! The kernel filter walks fragmented datagrams itself. If it cannot continue, it hands the
 //! datagram over: it reports the next submessage and captures only the remaining fragments. Such a
@@ -31,7 +31,8 @@ pub struct Limits {
     pub bytes: usize,
     /// Maximum number of unfinished datagrams.
     pub flows: usize,
-    /// Nanoseconds for which an unfinished datagram is kept. Linux: `ipfrag_time`, 30 s.
+    /// Nanoseconds for which an unfinished datagram is kept. Linux keeps it for 30 s with IPv4
+    /// (`ipfrag_time`), and for 60 s with IPv6 (`ip6frag_time`).
     pub timeout: u64,
     /// Maximum number of finished datagrams that are remembered.
     pub max_finished: usize,

@@ -100,7 +100,7 @@ impl Reattach {
         detached.unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// Returns for how long the thread has made no progress; `None` if it makes progress.
+    /// Returns how long the current step has taken if the thread is stalled; otherwise `None`.
     #[must_use]
     pub fn stalled(&self) -> Option<Duration> {
         self.shared.progress.stalled()

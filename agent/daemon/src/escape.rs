@@ -3,8 +3,7 @@
 
 use std::borrow::Cow;
 
-/// Escapes control characters and invisible characters, so that two names that look the same are
-/// the same.
+/// Escapes control characters and invisible characters.
 #[must_use]
 pub fn visible(text: &str) -> Cow<'_, str> {
     escaped(text, commands)

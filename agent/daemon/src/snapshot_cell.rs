@@ -515,7 +515,7 @@ mod tests {
     }
 
     #[test]
-    fn questions_about_many_names_are_bounded() {
+    fn late_call_requests_are_bounded() {
         let cell = SnapshotCell::new(SourceKind::Host);
         for number in 0..1000 {
             cell.request_late_calls(Some(&format!("/topic_{number}")), Some(Duration::ZERO));

@@ -1,4 +1,4 @@
-//! Rows of topics and processes.
+//! Rows of the history, for each topic and each process.
 
 /// Rows of one topic or process, in the order of their times.
 #[derive(Clone, Debug, Default, PartialEq)]

@@ -26,7 +26,7 @@ const FILES_PER_TIER: u64 = 24;
 const MAX_FILES: usize = 256;
 /// Free space below which nothing is written, in bytes. Other programs need the rest.
 const MIN_FREE: u64 = 64 << 20;
-/// Ending of the files' names.
+/// File name extension.
 const FILE_EXTENSION: &str = "history";
 
 /// Resolution of rows.
@@ -87,7 +87,7 @@ impl Tier {
         }
     }
 
-    /// Returns the maximum time of a file, in seconds.
+    /// Returns the time that one file covers at most, in seconds.
     const fn span(self) -> u32 {
         match self {
             Self::Seconds => 3_600,
@@ -161,7 +161,8 @@ impl Store {
         Ok(())
     }
 
-    /// Stores the new state of the last file of a tier. Returns the oldest files beyond the budget.
+    /// Stores the new state of the last file of a tier. Returns the oldest files that exceed the
+    /// budget.
     fn replace_last(&self, tier: Tier, file: Blocks, budget: u64) -> Vec<Blocks> {
         let mut tiers = self.lock();
         let Some(files) = tiers.get_mut(tier as usize) else {

@@ -11,8 +11,8 @@ const UDP: u8 = 17;
 const UDP_HEADER: usize = 8;
 /// Maximum end of a fragment in its datagram, in bytes: lengths in IP have 16 bits.
 const LARGEST_DATAGRAM: u32 = 65_535;
-/// Maximum number of extension headers. RFC 8200 has each header once and destination options
-/// twice; a few more are accepted.
+/// Maximum number of headers after the IPv6 header, that of the transport included. RFC 8200 has
+/// each extension header once and destination options twice; a few more are accepted.
 const MOST_EXTENSION_HEADERS: usize = 8;
 
 /// Parses an IPv4 packet. `length` is the length on the wire of the cursor's outermost slice.

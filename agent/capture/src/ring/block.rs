@@ -60,7 +60,7 @@ pub struct Frames<'a> {
 }
 
 impl<'a> Frames<'a> {
-    /// Reads a block that belongs to user space.
+    /// Reads the frames of a block that the kernel has handed to user space.
     #[must_use]
     pub fn new(block: &'a [u8]) -> Self {
         let header = (|| {

@@ -31,7 +31,7 @@ const MAX_QUIET_ROUNDS: u32 = 32;
 const MAX_DEPTH: usize = 8;
 /// Number of rounds in which a new process may still move to a cgroup in scope.
 const MOVING_ROUNDS: u32 = 3;
-/// Maximum number of rounds without a new process that use the same list of processes.
+/// Maximum number of rounds that reuse the last list of processes while no process starts.
 const MAX_REUSED_ROUNDS: u32 = 5;
 
 /// Device and inode of a directory of shared memory.

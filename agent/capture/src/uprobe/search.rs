@@ -497,7 +497,7 @@ mod tests {
     }
 
     #[test]
-    fn a_library_beyond_the_cap_is_uncovered_until_another_one_is_detached() {
+    fn a_library_beyond_the_cap_gets_no_probe_until_another_is_detached() {
         let directory = tempfile::tempdir().unwrap();
         let program = ros2probe_testing::harness::peer::built("handed").unwrap();
         for number in 0..=Libraries::CAP {

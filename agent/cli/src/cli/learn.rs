@@ -160,8 +160,8 @@ impl Session {
         Ok(())
     }
 
-    /// Views the topics. A request fails shortly before the stream of an agent that is stopping
-    /// ends.
+    /// Polls the topics. An error shortly before the event stream ends counts as the end of the
+    /// agent.
     fn view_until_end(&mut self, lines: &mut Lines<'_>, agent: &Agent) -> Result<()> {
         let viewed = self.view(agent);
         match viewed {

@@ -1,6 +1,6 @@
 //! Notes on stderr beside the output of a verb: sampled topics, messages that could not be
-//! captured, and reasons for silence. Each note is printed once, as soon as it is known. The output
-//! on stdout matches ros2cli.
+//! captured, and reasons for silence. Each note is printed once, when its cause is known. The
+//! output on stdout matches ros2cli.
 
 use std::collections::{BTreeMap, HashSet};
 use std::sync::{Mutex, MutexGuard, PoisonError};

@@ -151,7 +151,7 @@ fn stamp(nanoseconds: i64) -> Option<(i32, u32)> {
     Some((seconds, rest))
 }
 
-/// Parses a GUID. Other formats become the unknown GUID.
+/// Parses a GUID. Returns the unknown GUID for text in any other format.
 fn guid(text: &str) -> Guid {
     let parts = text.split_once('.').and_then(|(prefix, entity)| {
         Some(Guid {

@@ -66,7 +66,7 @@ pub enum FixError {
     Run {
         /// The command.
         command: String,
-        /// Error of the start.
+        /// Why the command could not be started.
         source: io::Error,
     },
     /// A program failed.
@@ -145,7 +145,7 @@ fn capabilities(remedy: &Remedy) -> Option<&str> {
 }
 
 impl Change {
-    /// Returns what is done, a line for each step.
+    /// Returns a description of each step, one per line.
     #[must_use]
     pub fn steps(&self) -> Vec<String> {
         match self {

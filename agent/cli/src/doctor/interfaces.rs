@@ -352,7 +352,7 @@ mod tests {
     }
 
     #[test]
-    fn a_host_without_a_network_and_a_tunnel_with_a_small_mtu_lead_to_notes() {
+    fn missing_networks_and_small_tunnel_mtus_are_reported_as_notes() {
         assert_eq!(
             severity(&found(&[LO], false), "interfaces"),
             Some(Severity::Note)

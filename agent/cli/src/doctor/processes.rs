@@ -591,7 +591,7 @@ mod tests {
     }
 
     #[test]
-    fn unreadable_processes_are_unknown_or_for_root_a_note() {
+    fn unreadable_processes_are_unknown_and_only_a_note_for_root() {
         let closed = |closed: &[u32]| Processes {
             closed: closed.to_vec(),
             ..Processes::default()

@@ -72,7 +72,7 @@ type Samples = Vec<(Labels, f64)>;
 type ByRobot<T> = BTreeMap<String, T>;
 
 impl State {
-    /// Returns its text.
+    /// Returns the label that `rp fleet` prints.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {

@@ -145,7 +145,7 @@ mod tests {
         }
 
         #[test]
-        fn a_summary_is_ordered(values in prop::collection::vec(0.0..1e6, 1..50)) {
+        fn summary_values_are_ordered(values in prop::collection::vec(0.0..1e6, 1..50)) {
             let it = Summary::of(values).unwrap();
             prop_assert!(it.minimum <= it.median && it.median <= it.p95 && it.p95 <= it.maximum);
             prop_assert!(it.deviation >= 0.0);

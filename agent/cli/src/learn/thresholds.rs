@@ -521,7 +521,7 @@ impl Windows {
         rate * seconds + MESSAGE_TOLERANCE > self.rates.maximum * seconds
     }
 
-    /// Returns the expectation of these rates in windows of this length.
+    /// Returns the expectation of the rate in windows of this length.
     fn expecting(&self, low: Option<f64>, high: Option<f64>) -> ExpectationValues {
         let window = u32::try_from(self.seconds).ok();
         ExpectationValues {

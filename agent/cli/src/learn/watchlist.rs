@@ -26,7 +26,7 @@ pub struct Source<'a> {
     pub domain_id: u32,
     /// Whether entries name the domain, because the agent sees several.
     pub names_domain: bool,
-    /// Time of the first and the last view.
+    /// Times of the first and the last poll.
     pub period: (&'a str, &'a str),
     /// Number of whole seconds of learning.
     pub seconds: u32,

@@ -127,7 +127,7 @@ mod tests {
     }
 
     #[test]
-    fn calls_are_printed_with_the_transports_of_unseen_calls() {
+    fn calls_and_the_transports_of_unobserved_calls_are_printed() {
         let mut service = Service {
             unseen: vec!["shared_memory".into()],
             ..Service::default()

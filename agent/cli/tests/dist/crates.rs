@@ -86,7 +86,7 @@ fn compiled(crate_name: &str) -> Result<Vec<PathBuf>> {
 }
 
 #[test]
-fn each_file_that_rp_is_compiled_from_is_packed_in_a_crate() -> Result<()> {
+fn every_source_file_of_rp_is_in_a_published_crate() -> Result<()> {
     let mut packed = BTreeSet::new();
     let mut read = compiled("rp")?;
     for (name, directory) in published()? {

@@ -271,7 +271,7 @@ fn rp_replaces_python_and_receives_signals() -> Result<()> {
 }
 
 #[test]
-fn rp_in_path_precedes_the_package_and_its_absence_is_one_line() -> Result<()> {
+fn path_takes_precedence_over_the_packaged_rp() -> Result<()> {
     const FIND: &str = "from ros2probe_cli.program import find; print(find())";
     let prefix = prefix()?;
     let found = succeed(&mut python(prefix.path(), FIND, &[]))?;
@@ -283,7 +283,11 @@ fn rp_in_path_precedes_the_package_and_its_absence_is_one_line() -> Result<()> {
     let path = format!("{SYSTEM}:{}", directory.display());
     let found = succeed(python_with_path.env("PATH", path))?;
     ensure!(Path::new(found.trim()) == first, "{found}");
+    Ok(())
+}
 
+#[test]
+fn a_missing_rp_is_reported_in_one_line() -> Result<()> {
     let missing = python(Path::new("/nowhere"), EXECUTE, &["top"]).output()?;
     let text = String::from_utf8(missing.stderr)?;
     ensure!(missing.status.code() == Some(1) && text.lines().count() == 1);

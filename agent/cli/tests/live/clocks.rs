@@ -35,7 +35,7 @@ fn a_clock_half_a_millisecond_ahead_is_within_the_bounds() -> Result<()> {
 }
 
 #[test]
-fn a_clock_20_milliseconds_behind_is_within_the_bounds_and_a_finding() -> Result<()> {
+fn a_clock_20_ms_behind_is_bounded_and_reported() -> Result<()> {
     is_within_bounds(Stack::Cyclone, "-0.02", -0.02, 0.0)
 }
 

@@ -326,7 +326,7 @@ fn managed_nodes_batteries_and_extracted_fields_have_metrics_and_findings() -> R
 }
 
 #[test]
-fn a_name_with_a_mistake_and_a_frame_without_a_transform_are_found() -> Result<()> {
+fn misspelt_names_and_frames_without_transforms_are_reported() -> Result<()> {
     let link = Link::new()?;
     let config = tempfile::tempdir()?;
     let agent = agent(&link, &config, "")?;

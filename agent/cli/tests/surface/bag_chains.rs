@@ -166,7 +166,7 @@ fn a_bag_has_the_same_hops_as_its_capture() {
 }
 
 #[test]
-fn the_text_has_topics_and_the_kind_of_times_but_no_nodes() {
+fn text_output_lists_topics_and_the_source_of_times_without_nodes() {
     let directory = temporary();
     let output = ask(&converted(directory.path()), &[]);
     let text = stdout(&output);

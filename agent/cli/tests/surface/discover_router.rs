@@ -297,7 +297,7 @@ fn tokens_beyond_the_cap_end_the_conversation() {
 }
 
 #[test]
-fn bytes_beyond_the_cap_end_the_conversation_even_if_aliases_contain_them() {
+fn responses_beyond_the_byte_cap_end_the_session_even_through_aliases() {
     let mut session = asked();
     let batch = [0x04; 60_000];
     for _ in 0..MOST_BYTES / batch.len() {
@@ -354,7 +354,7 @@ fn answers_in_the_wrong_order_are_refused() {
 
 proptest! {
     #[test]
-    fn any_batches_are_read_or_refused(batches: Vec<Vec<u8>>, answers: bool) {
+    fn arbitrary_batches_never_panic(batches: Vec<Vec<u8>>, answers: bool) {
         let mut session = if answers { asked() } else { Session::new(None) };
         for batch in &batches {
             let _ = session.beginning(batch);

@@ -105,7 +105,7 @@ fn seeds_of_library_trees_cause_no_panic() {
 }
 
 #[test]
-fn seeds_of_streams_cause_no_panic() {
+fn stream_fuzz_seeds_do_not_panic() {
     run_up_to(700, "fuzz/seeds/stream", entry::stream);
 }
 

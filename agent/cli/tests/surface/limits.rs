@@ -205,7 +205,7 @@ fn unknown_writers_beyond_the_cap_are_not_followed_until_one_is_forgotten() {
 }
 
 #[test]
-fn flows_beyond_the_cap_are_not_followed_until_others_are_silent() {
+fn flows_beyond_the_cap_are_tracked_once_others_expire() {
     let limits = Limits {
         flows: 2,
         ..Limits::default()

@@ -575,7 +575,7 @@ mod defaults {
     pub(super) const ORIGINS: [&str; 2] = ["https://app.foxglove.dev", "file://"];
     pub(super) const HISTORY_S: u32 = 600;
 
-    /// Size of seven days of some hundred topics.
+    /// Room for seven days of about 400 topics, in steps of 10 s.
     pub(super) const HISTORY_BYTES: u64 = 256 << 20;
     pub(super) const SNAPSHOT_COUNT: usize = 20;
     pub(super) const SNAPSHOT_TOTAL_BYTES: u64 = 1 << 30;

@@ -51,7 +51,8 @@ pub enum Role {
         needs_bpf: bool,
     },
     /// Reading shared memory. `CAP_SYS_PTRACE`, if granted, opens `/proc/<pid>/root` and hence the
-    /// shared memory of containers. `CAP_SYS_NICE` is kept if no limit allows its priority.
+    /// shared memory of containers. `CAP_SYS_NICE` is kept if no resource limit (`RLIMIT_RTPRIO`,
+    /// `RLIMIT_NICE`) permits the priority.
     SharedMemory {
         /// Whether the priority requires `CAP_SYS_NICE`, as [`Role::shared_memory`] determines.
         needs_nice: bool,

@@ -71,7 +71,7 @@ struct Snapshot {
 }
 
 impl Snapshots {
-    /// Starts all snapshots.
+    /// Starts one buffer and one thread for each configured snapshot.
     ///
     /// # Errors
     ///

@@ -359,7 +359,8 @@ fn stalled(live: &LiveSource, part: Part) -> Option<String> {
     stalled.map(|stalled| stalled.to_string())
 }
 
-/// Returns the state of exact mode for each library; empty if exact mode is off.
+/// Returns the state of exact mode for each library; empty if exact mode is off. If exact mode is
+/// unavailable, one entry without a library has the reason.
 fn exact(live: &LiveSource) -> Vec<ExactFacts> {
     let whole = |reason: &str| ExactFacts {
         library: String::new(),

@@ -268,7 +268,7 @@ fn dropping_a_subscription_ends_its_request_and_allows_another_one() {
 }
 
 #[test]
-fn patterns_of_all_subscriptions_together_are_bounded() {
+fn globs_and_regular_expressions_of_all_subscriptions_are_bounded() {
     let all = subscriptions(Caps {
         subscriptions: 100,
         ..caps()

@@ -34,7 +34,7 @@ use ros2probe_metrics::remote_write;
 /// of metrics have all parts.
 #[derive(Clone, Debug)]
 pub struct MetricSources {
-    /// State of the robot and the agent.
+    /// Latest snapshot of the robot and the agent.
     pub latest: Arc<SnapshotCell>,
     /// Display settings and the result of the last reload.
     pub settings: Arc<SettingsCell>,

@@ -437,7 +437,7 @@ mod tests {
     }
 
     #[tokio::test(start_paused = true)]
-    async fn a_slowly_read_answer_ends_its_connection_sooner_than_a_stalled_stream() {
+    async fn slow_readers_are_disconnected_before_stalled_streams() {
         for (is_whole, seconds) in [(true, 10..=20), (false, 75..=75)] {
             let (_crowd, join) = connections();
             let (mut connection, mut client) = join();

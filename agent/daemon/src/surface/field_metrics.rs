@@ -250,8 +250,8 @@ impl FieldMetrics {
         })
     }
 
-    /// Returns the type of each message. A search reads files, so that a thread for blocking work
-    /// does it, if there is a runtime; the next page has the result.
+    /// Returns the type of each message. With a runtime, a thread for blocking work reads the files
+    /// of the search, and the next scrape has the result.
     fn types(&self, messages: &[FieldMessage]) -> Vec<Arc<Search>> {
         let mut known = self.types.lock().unwrap_or_else(PoisonError::into_inner);
         let before = std::mem::take(&mut *known);

@@ -87,7 +87,7 @@ pub struct DescribedFigures {
     pub bytes: usize,
     /// Types that were described for the first time.
     pub learned: u64,
-    /// Responses that cannot be used.
+    /// Number of rejected responses.
     pub refused: u64,
     /// Lookups for which only descriptions with another hash than the announced one exist.
     pub mismatched: u64,

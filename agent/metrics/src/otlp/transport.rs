@@ -23,7 +23,8 @@ use super::encoded::EncodedSender;
 use super::reports;
 use super::settings::{SettingsError, Target};
 
-/// Interval of HTTP/2 pings; a connection that does not answer a ping is reopened.
+/// Interval of HTTP/2 pings while a request is open. A connection that does not answer a ping is
+/// closed and opened again.
 const PING_INTERVAL: Duration = Duration::from_secs(30);
 
 /// The connection of a signal; opened at the first request, and again after a failure.

@@ -14,7 +14,7 @@ pub enum Request {
     Refused,
 }
 
-/// What became of a sample.
+/// Outcome of a sample.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SampleFate {
     /// The receiver wrote it.

@@ -11,9 +11,9 @@ use super::samples::{Scrape, parts};
 /// Version of the protocol.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Version {
-    /// Each series has its names and labels as texts.
+    /// Remote write 1.0: each series carries its name and labels as text.
     One,
-    /// Texts are sent once, series have numbers, and metrics have types.
+    /// Remote write 2.0: series refer to texts by number, and metrics have types.
     Two,
 }
 

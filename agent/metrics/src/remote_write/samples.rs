@@ -215,7 +215,7 @@ mod tests {
     }
 
     #[test]
-    fn a_series_that_ended_is_stale_once() {
+    fn an_ended_series_gets_one_staleness_marker() {
         let mut samples = Samples::default();
         let mut collect = |requests: Option<u64>| {
             samples.begin();

@@ -261,7 +261,7 @@ mod tests {
         }
 
         #[test]
-        fn the_range_of_a_difference_holds_all_its_values(
+        fn the_range_of_a_histogram_difference_contains_all_values(
             first in prop::collection::vec(0.0..100.0_f64, 0..20),
             then in prop::collection::vec(0.0..100.0_f64, 1..20),
         ) {

@@ -250,7 +250,7 @@ impl Head {
         self.path == Path::SharedMemory { exact: false }
     }
 
-    /// Returns whether a probe in the sending process saw it. A probe sees every message.
+    /// Returns whether a uprobe in the sending process saw it. Uprobes do not sample.
     #[must_use]
     pub fn is_exact(&self) -> bool {
         self.path == Path::SharedMemory { exact: true }

@@ -26,7 +26,7 @@ use crate::facts::observation::{AckNack, Content, Gap, Heartbeat, Sample};
 use crate::facts::route::Direction;
 use crate::facts::route::{Receiver, Route};
 use crate::facts::tables::WithheldLosses;
-use crate::measure::loss_causes::{LossCauses, REASSEMBLY_TIMEOUT};
+use crate::measure::loss_causes::{LossCauses, reassembly_timeout};
 use crate::measure::reception::{CompleteSample, Outcome, Reception};
 use crate::measure::samples::Budget;
 use crate::measure::sequence::MAX_TRUSTED_JUMP;
@@ -633,9 +633,10 @@ impl Delivery {
         context: &'a mut DeliveryContext<'_>,
     ) -> (&'a mut Reception, &'a mut Budget, Accounting<'a>) {
         let window = settle_window(self.is_reliable(context));
+        let timeout = reassembly_timeout(&self.main.destination);
         let until = context
             .reassembled
-            .then(|| context.now + REASSEMBLY_TIMEOUT.saturating_sub(window));
+            .then(|| context.now + timeout.saturating_sub(window));
         let accounting = Accounting {
             tally: &mut self.tally,
             loss_causes: &mut self.loss_causes,

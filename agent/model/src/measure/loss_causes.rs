@@ -1,8 +1,9 @@
 //! Known causes of losses on this host for one receiver, and losses whose cause may still be
 //! reported.
 //!
-//! The kernel reports a full socket buffer immediately and a failed IP reassembly half a minute
-//! later. A loss that may be a failed reassembly stays pending until then.
+//! The kernel reports a full socket buffer immediately. It reports a failed IP reassembly half a
+//! minute later, with IPv6 a minute. A loss that may be a failed reassembly stays pending until
+//! then.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -12,10 +13,25 @@ use ros2probe_wire::SequenceNumber;
 use crate::facts::bounded::Bounded;
 use crate::facts::loss::LossCause;
 use crate::facts::model_time::ModelTime;
+use crate::facts::route::Destination;
 use crate::facts::tables::{KnownLosses, OpenLosses};
 
-/// By default, the kernel waits 30 s for IP fragments (`net.ipv4.ipfrag_time`).
-pub const REASSEMBLY_TIMEOUT: Duration = Duration::from_secs(35);
+/// By default, the kernel waits 30 s for fragments of IPv4 (`net.ipv4.ipfrag_time`).
+const REASSEMBLY_TIMEOUT: Duration = Duration::from_secs(35);
+/// By default, the kernel waits 60 s for fragments of IPv6 (`net.ipv6.ip6frag_time`).
+const REASSEMBLY_TIMEOUT_IPV6: Duration = Duration::from_secs(65);
+
+/// Returns how long after its departure a sample to this destination may fail in IP reassembly.
+/// Messages without a network have the address zero.
+#[must_use]
+pub fn reassembly_timeout(destination: &Destination) -> Duration {
+    let address = destination.socket_address().ip();
+    if address.is_ipv6() && !address.is_unspecified() {
+        REASSEMBLY_TIMEOUT_IPV6
+    } else {
+        REASSEMBLY_TIMEOUT
+    }
+}
 
 /// Known causes and pending losses.
 #[derive(Debug, Default)]
@@ -165,6 +181,8 @@ impl LossCauses {
 
 #[cfg(test)]
 mod tests {
+    use std::net::SocketAddr;
+
     use super::*;
 
     fn at(seconds: u64) -> ModelTime {
@@ -182,6 +200,18 @@ mod tests {
             runs.push((first.0, last.0, cause));
         });
         runs
+    }
+
+    #[test]
+    fn a_loss_by_ipv6_stays_pending_as_long_as_the_kernel_waits_for_fragments() {
+        let timeout = |address: &str| {
+            let address: SocketAddr = address.parse().unwrap();
+            reassembly_timeout(&Destination::from(address)).as_secs()
+        };
+        assert_eq!(timeout("[fd00::2]:7411"), 65);
+        assert_eq!(timeout("[ff02::1]:7400"), 65);
+        assert_eq!(timeout("10.0.0.2:7411"), 35);
+        assert_eq!(reassembly_timeout(&Destination::default()).as_secs(), 35);
     }
 
     #[test]

@@ -185,7 +185,7 @@ impl<'a> Captured<'a> {
 pub struct NewLog {
     /// Time of its arrival.
     pub arrival: Timestamp,
-    /// Its trace id, if it is traced.
+    /// Trace id; `None` if the message is not traced.
     pub trace_id: Option<u128>,
     /// The message.
     pub message: Arc<LogMessage>,

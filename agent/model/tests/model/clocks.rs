@@ -267,7 +267,7 @@ fn few_or_repeated_messages_are_not_evidence_of_a_round_trip() {
 }
 
 #[test]
-fn one_acknowledgement_is_a_round_trip_for_ten_minutes() {
+fn one_acknowledgement_bounds_the_clock_for_ten_minutes() {
     let mut pair = Pair::new();
     // Alice is unknown as a peer until her first message.
     pair.send_from_bob();

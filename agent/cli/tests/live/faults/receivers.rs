@@ -80,7 +80,7 @@ impl Receiver {
 }
 
 #[test]
-fn misbehaving_receivers_and_scrapers_are_counted_and_lose_no_message() -> Result<()> {
+fn misbehaving_receivers_and_scrapers_are_counted_and_cause_no_loss() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let hanging = Receiver::start(&link.robot, None)?;

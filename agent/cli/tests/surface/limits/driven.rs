@@ -33,7 +33,7 @@ pub const KEYS: &[[&str; 2]] = &[
     ],
     [
         "flows",
-        "flows_beyond_the_cap_are_not_followed_until_others_are_silent",
+        "flows_beyond_the_cap_are_tracked_once_others_expire",
     ],
     [
         "watches",

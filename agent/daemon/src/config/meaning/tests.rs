@@ -425,7 +425,7 @@ fn parsing_a_truncated_file_never_panics() {
 }
 
 #[test]
-fn a_chain_that_has_equal_ends_has_a_glob_or_is_repeated_is_reported() {
+fn chains_with_equal_ends_globs_or_duplicates_are_rejected() {
     let mistakes = |yaml: &str| Config::parse(yaml.as_bytes()).unwrap_err().report("file");
     let same = mistakes("chains: [{from: /a, to: /a}]");
     assert!(

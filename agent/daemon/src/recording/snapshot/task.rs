@@ -94,7 +94,7 @@ impl SnapshotTask {
                 self.take(item);
             }
             if is_clock {
-                // A replay may pass many seconds between two polls.
+                // A replay may skip many seconds between two polls.
                 self.read_events();
             }
             if looked.elapsed() < POLL_INTERVAL {

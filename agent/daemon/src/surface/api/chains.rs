@@ -79,8 +79,8 @@ async fn list(
 }
 
 /// Returns the API representation of chains, cut at the topics with the ROS names `from` and `to`.
-/// Chains without both topics are left out. Of equal parts, the part with the most messages stays.
-/// `None` means no cut.
+/// Omits chains that do not contain both topics. If several parts are equal, keeps the one with the
+/// most messages. `None` means no cut.
 #[must_use]
 pub fn parts<'a>(
     facts: impl Iterator<Item = &'a ChainFacts>,

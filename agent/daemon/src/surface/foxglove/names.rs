@@ -1,5 +1,5 @@
-//! Names of topics for viewers, which do not know domains. A name in several domains belongs to one
-//! of them. In the other domains, the name has the domain as a prefix.
+//! Topic names for viewers, which have no domains. A name in several domains belongs to one of
+//! them. In the other domains, the name has the domain as a prefix.
 
 use std::collections::BTreeMap;
 

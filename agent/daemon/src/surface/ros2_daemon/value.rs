@@ -243,7 +243,7 @@ mod tests {
     }
 
     #[test]
-    fn an_answer_beyond_the_cap_is_a_fault() {
+    fn an_oversized_response_is_an_xmlrpc_fault() {
         let large = |bytes: usize| Value::array([Value::Text("a".repeat(bytes)), Value::Nil]);
         assert!(answer(&Ok(large(MAX_ANSWER / 2))).contains("<params>"));
         let body = answer(&Ok(large(MAX_ANSWER + 1)));

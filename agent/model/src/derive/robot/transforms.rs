@@ -1,7 +1,7 @@
 //! Transforms: the trees of frames, their broadcasters, and what is wrong with them.
 //!
 //! A tree belongs to one domain and one namespace, because a robot may publish on `/robot1/tf` and
-//! `/robot1/tf_static`. An edge has the name of its child frame, of which it is the only parent.
+//! `/robot1/tf_static`. Its child frame, which has one parent, identifies an edge.
 
 mod edge;
 

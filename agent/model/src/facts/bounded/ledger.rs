@@ -20,8 +20,8 @@ pub struct Use {
 }
 
 impl Use {
-    /// Returns whether the table was filled to its cap, or to nine tenths of a cap in bytes, and
-    /// never beyond.
+    /// Returns whether the table reached its cap and never exceeded it. Caps from 2^18 count bytes:
+    /// nine tenths of them suffice.
     #[must_use]
     pub const fn is_driven(&self) -> bool {
         const IN_BYTES: usize = 1 << 18;

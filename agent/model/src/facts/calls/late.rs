@@ -183,7 +183,7 @@ pub struct Handoff {
     pub woken_before: Duration,
     /// For how long the executor's thread could run and did not before that, since the call before.
     pub runnable_before: Duration,
-    /// It was woken for the message; `None` if that is not known.
+    /// How long before the call it was woken for the message; `None` if that is unknown.
     pub received_before: Option<Duration>,
     /// What it did between the two.
     pub receiver: WaitingStates,

@@ -13,8 +13,7 @@ impl LateCall {
         self.wait.unwrap_or_default() + self.duration
     }
 
-    /// Returns the parts of the time of the call, in the order of their time. They add up to
-    /// [`Self::total`].
+    /// Returns the parts of the call in chronological order. They add up to [`Self::total`].
     ///
     /// The sums are those of the scheduler's accounting. The events divide them: events can get
     /// lost, and the accounting cannot. Only the CPU time is that of the events, if none is

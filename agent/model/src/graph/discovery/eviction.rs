@@ -122,7 +122,7 @@ impl Victims {
             now + SEARCH_INTERVAL.max(SEARCH_TIME_PER_ENTRY.saturating_mul(visited));
     }
 
-    /// Returns the next entry to evict for the new one.
+    /// Returns the entry to evict for the new one; `None` if every entry must stay.
     fn next(&mut self, discovery: &Discovery, table: Table, newcomer: Newcomer) -> Option<Guid> {
         let Newcomer { guid, priority } = newcomer;
         // A packet since the search makes an entry active again.

@@ -293,9 +293,9 @@ pub(super) fn named(nodes: &[Node]) -> usize {
 }
 
 /// Returns the participant's domain and its source. Without an announced domain, it follows from
-/// the destination port (RTPS 2.5, 9.6.2.3). For domain d, the multicast port is 7400 + 250 d, and
-/// unicast ports are 7410 + 250 d + 2 p. Ports of 32768 and above are mostly ephemeral, so the
-/// domain is then assumed to be 0.
+/// the destination port of discovery (RTPS 2.5, 9.6.2.3). For domain d, the multicast port of
+/// discovery is 7400 + 250 d, and its unicast ports are 7410 + 250 d + 2 p. Ports of 32768 and
+/// above are mostly ephemeral, so the domain is then assumed to be 0.
 pub(super) fn domain(announced: Option<DomainId>, origin: &Origin) -> (DomainId, DomainSource) {
     const FIRST_EPHEMERAL_PORT: u16 = 32_768;
     if let Some(domain_id) = announced.filter(|domain_id| *domain_id <= DomainId::MAX) {

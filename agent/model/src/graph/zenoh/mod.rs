@@ -198,7 +198,7 @@ impl Zenoh {
         self.counters.batches > 0 || !self.unseen.is_empty()
     }
 
-    /// Returns the state of the connections to save.
+    /// Returns the state of the connections that a restart of the agent needs.
     #[must_use]
     pub fn memory(&self) -> ZenohMemory {
         let (senders, relayed) = self.remembered.parts();

@@ -246,7 +246,7 @@ impl Observer {
                     longest = seconds.max(longest);
                 }
                 if writers.len() > 1 {
-                    // Others may fill the gaps of one writer.
+                    // Messages of other writers may fall into the gaps of one writer.
                     sum.longest_interval = 0.0;
                 }
                 (sum, longest)

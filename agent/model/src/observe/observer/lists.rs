@@ -364,7 +364,7 @@ fn published(topic: &Topic, endpoint: &Endpoint) -> dispatch::Topic {
 
 pub(super) fn traits(guid: Guid, endpoint: &Endpoint) -> Traits {
     Traits {
-        // TCP retransmits for Zenoh unseen, so a missing number will not arrive.
+        // The agent does not see TCP retransmissions of Zenoh, so a missing number never arrives.
         reliable: !guid.prefix.is_zenoh() && endpoint.qos.reliability == Reliability::RELIABLE,
         keeps_history: endpoint.qos.durability != Durability::VOLATILE,
         has_header: begins_with_header(&endpoint.message_type),

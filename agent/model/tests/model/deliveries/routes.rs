@@ -114,7 +114,7 @@ fn samples_on_both_routes_before_they_are_merged_count_once() {
 }
 
 #[test]
-fn a_copy_of_a_sample_that_arrives_after_its_route_is_merged_is_a_duplicate() {
+fn a_copy_after_its_route_was_merged_is_a_duplicate() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     let group = bob.multicast(101);

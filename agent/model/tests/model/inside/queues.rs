@@ -255,7 +255,7 @@ fn a_late_agent_counts_no_losses_from_before_its_start() {
 }
 
 #[test]
-fn takes_that_cannot_be_compared_with_arrivals_yield_no_queue() {
+fn unmatched_takes_and_arrivals_yield_no_reader_queue() {
     // No call is observed, because the process takes messages by other calls.
     let mut robot = Robot::new(BOB, 1, 110);
     robot.is_observed = false;

@@ -101,7 +101,7 @@ fn a_total_continues_when_the_last_remote_subscriber_leaves() {
 }
 
 #[test]
-fn expectations_are_evaluated_on_a_topic_that_only_processes_show() {
+fn expectations_are_evaluated_on_topics_seen_only_inside_processes() {
     let mut world = World::new();
     let watch = |expectations: &str| {
         let mut watch = Watch::named("/scan").unwrap();

@@ -109,7 +109,7 @@ fn messages_of_the_cpu_key_are_those_of_the_publisher() {
 }
 
 #[test]
-fn a_message_that_the_cpu_key_skipped_is_lost() {
+fn a_sequence_gap_on_the_cpu_topic_is_a_loss() {
     let mut robot = Robot::new(&[Some(CPU)]);
     for number in 0..20 {
         match number {

@@ -78,7 +78,7 @@ mod tests {
     use ros2probe_history::{Block, Series, Tier, TopicRow};
 
     #[test]
-    fn the_rates_before_a_moment_precede_the_values() {
+    fn rates_of_the_preceding_minute_are_inserted_before_the_values() {
         let directory = tempfile::tempdir().unwrap();
         let store = Store::open(directory.path(), 1 << 20).unwrap();
         let row = |at| TopicRow {
