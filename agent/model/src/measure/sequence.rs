@@ -21,7 +21,7 @@ use crate::facts::bounded::Bounded;
 use crate::facts::model_time::ModelTime;
 use crate::facts::tables::{Checkpoints, SequenceGaps};
 use bitmap::Bitmap;
-pub use unconfirmed::Run;
+pub use unconfirmed::{NumberRange, Run};
 use unconfirmed::{REQUIRED_CONFIRMATIONS, UnconfirmedRun};
 
 /// Initial size of the window: the undecided and recently decided numbers that are remembered.

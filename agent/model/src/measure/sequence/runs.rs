@@ -33,7 +33,9 @@ impl Sequence {
                 return RunMembership::Unconfirmed { new };
             }
             let mut run = self.confirm();
-            run.numbers.retain(|(known, _)| *known != number);
+            // The caller processes this sample as one of the live run.
+            run.ranges
+                .retain(|range| range.is_whole || range.first != number);
             if let Some(source) = source {
                 self.sourced(number, source);
             }
@@ -97,10 +99,12 @@ impl Sequence {
 
     /// Records the samples of a confirmed run.
     pub fn accept(&mut self, run: &Run, now: ModelTime, settled: &mut impl FnMut(Settled)) {
-        for &(number, is_whole) in &run.numbers {
-            self.exists(number, now, settled);
-            if is_whole {
-                self.received.set(number);
+        for range in &run.ranges {
+            for number in range.first.until(range.last.next()) {
+                self.exists(number, now, settled);
+                if range.is_whole {
+                    self.received.set(number);
+                }
             }
         }
         let (start, end) = run.gap;
@@ -111,17 +115,17 @@ impl Sequence {
     pub(super) fn confirm(&mut self) -> Run {
         let unconfirmed = self.unconfirmed.take();
         let run = unconfirmed.map_or_else(Run::default, |unconfirmed| unconfirmed.into_run());
-        let Some((first, _)) = run.numbers.front() else {
+        let Some(first) = run.ranges.front().map(|range| range.first) else {
             return run;
         };
-        let jump = (*first >= self.next).then(|| *first - self.next);
+        let jump = (first >= self.next).then(|| first - self.next);
         // While the live run has only a few samples, a long jump is a restart rather than a loss.
         let most = match self.followed < REQUIRED_CONFIRMATIONS {
             true => MAX_ANNOUNCED_JUMP,
             false => MAX_JUMP,
         };
         if jump.is_none_or(|jump| jump > most) {
-            self.restart(*first);
+            self.restart(first);
         }
         run
     }
