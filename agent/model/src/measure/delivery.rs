@@ -29,15 +29,12 @@ use crate::facts::tables::WithheldLosses;
 use crate::measure::loss_causes::{LossCauses, REASSEMBLY_TIMEOUT};
 use crate::measure::reception::{CompleteSample, Outcome, Reception};
 use crate::measure::samples::Budget;
-use crate::measure::sequence::MAX_TRUSTED_JUMP;
+use crate::measure::sequence::{MAX_IRRELEVANT_AT_START, MAX_TRUSTED_JUMP};
 use crate::measure::undelivered::Undelivered;
 use crate::measure::writer::{BEST_EFFORT_WINDOW, settle_window};
 use accounting::Accounting;
 pub use accounting::Totals;
 
-/// Maximum number of samples, missed while there was no reader, that are marked irrelevant one by
-/// one. If there are more, the delivery restarts.
-const MAX_IRRELEVANT_AT_START: u64 = 512;
 /// Samples that left this host less than this ago may still arrive.
 const MAX_TRANSIT_TIME: Duration = Duration::from_secs(1);
 /// Samples that left for a receiver count as lost if it shows no sign of life for this time. Socket

@@ -45,6 +45,9 @@ pub const MIN_INCARNATION_GAP: Duration = Duration::from_millis(100);
 /// This many consecutive samples below the window also begin a new incarnation, whatever their
 /// source times.
 const MAX_STALE: u32 = 1024;
+/// Maximum number of samples without a reader that are marked irrelevant. If a run skips more, it
+/// restarts the numbers.
+pub const MAX_IRRELEVANT_AT_START: u64 = 512;
 /// Number of steps per window in which settling advances.
 const SETTLING_STEPS: u32 = 16;
 
@@ -85,6 +88,8 @@ pub struct Sequence {
     last_advance: ModelTime,
     /// Number of samples that continued this incarnation, at most 255.
     followed: u8,
+    /// Whether samples became visible after `last_advance`.
+    is_reopened: bool,
     unconfirmed: Option<Box<UnconfirmedRun>>,
     /// Number of runs, HEARTBEATs, GAPs and ACKNACKs that were unconfirmed.
     jumps: u64,
@@ -429,6 +434,12 @@ impl Sequence {
         };
         let times = [withdrawn, settled, noted.filter(|_| is_open)];
         times.into_iter().flatten().min().unwrap_or(ModelTime::MAX)
+    }
+
+    /// Sets whether samples became visible after [`Self::last_advance`]. A run that begins far ahead
+    /// then restarts the numbers, because the numbers between may belong to other samples.
+    pub const fn reopen(&mut self, is_reopened: bool) {
+        self.is_reopened = is_reopened;
     }
 
     /// Decides all open numbers.

@@ -25,7 +25,7 @@ use crate::measure::in_order::Progress;
 use crate::measure::reception::{Decision, Outcome, Reception};
 use crate::measure::sampled::Sampled;
 use crate::measure::samples::Budget;
-use crate::measure::sequence::{MAX_ANNOUNCED_JUMP, MAX_TRUSTED_JUMP};
+use crate::measure::sequence::{MAX_ANNOUNCED_JUMP, MAX_IRRELEVANT_AT_START, MAX_TRUSTED_JUMP};
 
 /// Time in which reordering may fill a gap of a best-effort writer.
 pub const BEST_EFFORT_WINDOW: Duration = Duration::from_secs(1);
@@ -320,8 +320,13 @@ impl Writer {
             }
             return counted;
         }
-        let sequence = self.reception.sequence();
-        let before = (sequence.next(), sequence.last_advance());
+        let sequence = self.reception.sequence_mut();
+        let next = sequence.next();
+        let is_reopened = sequence.last_advance() < opened;
+        sequence.reopen(is_reopened);
+        if is_reopened && let Observation::Sample(sample) = observation {
+            self.settle_before(sample.sequence_number, context);
+        }
         let mut counted = None;
         match observation {
             Observation::Sample(sample) => counted = self.sample(sample, context),
@@ -346,9 +351,8 @@ impl Writer {
             }
             Observation::Presence(_) => {}
         }
-        let (next, advanced) = before;
         let sequence = self.reception.sequence_mut();
-        if next > SequenceNumber::ZERO && advanced < opened && sequence.next() > next {
+        if next > SequenceNumber::ZERO && is_reopened && sequence.next() > next {
             // The newest sample is marked irrelevant too, which has no effect once it is received.
             sequence.mark_irrelevant(next, sequence.next());
         }
@@ -541,6 +545,16 @@ impl Writer {
             Outcome::Complete(_) => {}
         }
         None
+    }
+
+    /// Decides all known samples if the numbers may restart at `number`, far ahead of them.
+    fn settle_before(&mut self, number: SequenceNumber, context: &mut MeasurementContext<'_>) {
+        let next = self.reception.sequence().next();
+        if number.steps_since(next) > MAX_IRRELEVANT_AT_START {
+            let (reception, mut settling) =
+                self.parts(context.journal, (context.now, context.has_receivers));
+            reception.settle_known(context.budget, &mut |decision| settling.take(decision));
+        }
     }
 
     /// Returns whether the number of this DATA or DATA_FRAG is outside the writer's live run.

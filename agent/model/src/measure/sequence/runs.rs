@@ -3,6 +3,7 @@
 use ros2probe_wire::{SequenceNumber, Timestamp};
 
 use super::MAX_ANNOUNCED_JUMP;
+use super::MAX_IRRELEVANT_AT_START;
 use super::MAX_JUMP;
 use super::MAX_STALE;
 use super::MIN_INCARNATION_GAP;
@@ -121,6 +122,7 @@ impl Sequence {
         let jump = (first >= self.next).then(|| first - self.next);
         // While the live run has only a few samples, a long jump is a restart rather than a loss.
         let most = match self.followed < REQUIRED_CONFIRMATIONS {
+            _ if self.is_reopened => MAX_IRRELEVANT_AT_START,
             true => MAX_ANNOUNCED_JUMP,
             false => MAX_JUMP,
         };

@@ -339,6 +339,24 @@ fn samples_sent_to_other_hosts_before_a_local_reader_existed_are_not_lost() {
 }
 
 #[test]
+fn a_hundred_thousand_samples_without_a_reader_are_not_lost() {
+    let mut bench = Bench::new(Traits::default());
+    for number in 1..=100 {
+        bench.now += MILLISECOND;
+        bench.data(number);
+    }
+    bench.wait(100_000);
+    bench.opened = ModelTime::from_nanoseconds(bench.now);
+    for number in 100_101..=100_200 {
+        bench.now += MILLISECOND;
+        bench.data(number);
+    }
+    bench.wait(5000);
+    let facts = bench.facts();
+    assert_eq!((facts.messages, facts.lost, facts.duplicates), (200, 0, 0));
+}
+
+#[test]
 fn messages_at_200_hz_have_a_rate_of_200_hz() {
     let mut bench = Bench::new(Traits::default());
     bench.now += 1234;

@@ -145,6 +145,29 @@ fn an_acknowledged_sample_that_was_not_captured_is_not_lost() {
 }
 
 #[test]
+fn a_hundred_thousand_samples_written_without_a_reader_are_lost_at_neither_end() {
+    for is_sender in [false, true] {
+        let mut host = Host::new();
+        let bob = host.reader(BOB, 7411);
+        let seen = if is_sender { bob.leaving() } else { bob };
+        for number in 1..=100 {
+            host.data(seen, number);
+            host.wait(10);
+        }
+        host.unsubscribe(BOB, 2);
+        (0..100).for_each(|_| host.wait(1000));
+        host.subscribe(BOB, 3);
+        for number in 100_101..=100_200 {
+            host.data(seen, number);
+            host.wait(10);
+        }
+        (0..15).for_each(|_| host.wait(1000));
+        let facts = host.measurement();
+        assert_eq!((facts.messages, facts.lost), (200, 0), "{is_sender}");
+    }
+}
+
+#[test]
 fn samples_written_while_a_reader_was_absent_are_not_lost() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
