@@ -92,6 +92,8 @@ pub struct Delivery {
     recent: RecentLoss,
     /// Whether all readers are best effort: they get no retransmissions and no HEARTBEATs.
     best_effort: bool,
+    /// Whether the writer applies a content filter of each reader.
+    is_filtered: bool,
     /// Whether samples use the network, at least for some readers, rather than only shared memory.
     uses_network: bool,
     /// The latest losses, while the delivery is withheld.
@@ -122,6 +124,7 @@ impl Delivery {
             overdue: 0,
             recent: RecentLoss::default(),
             best_effort: false,
+            is_filtered: false,
             uses_network: false,
             withheld: None,
             connection: None,
@@ -225,9 +228,17 @@ impl Delivery {
         self.reception.interrupt();
     }
 
-    /// Sets whether all readers are best effort.
-    pub const fn learn(&mut self, best_effort: bool) {
-        self.best_effort = best_effort;
+    /// Sets whether all readers are best effort, and whether the writer applies a content filter of
+    /// each. A missing sample without a known cause is then irrelevant, because the filter may have
+    /// rejected it.
+    pub const fn learn(&mut self, best_effort: bool, is_filtered: bool) {
+        (self.best_effort, self.is_filtered) = (best_effort, is_filtered);
+    }
+
+    /// Returns whether the writer applies a content filter of each reader.
+    #[must_use]
+    pub const fn is_filtered(&self) -> bool {
+        self.is_filtered
     }
 
     /// Records that the last reader is gone: samples after the last received one do not count as
@@ -642,6 +653,7 @@ impl Delivery {
             writer: context.writer,
             receiver: self.receiver,
             main: self.main,
+            is_filtered: self.is_filtered,
             at: context.now,
             until,
             in_order_from: self

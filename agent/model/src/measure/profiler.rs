@@ -251,6 +251,7 @@ impl Profiler {
                 .subscribers
                 .get_or_insert_with(|| Box::new(Subscribers::new(measured.complete_from)));
             novelty = subscribers.observe(observation, &mut context);
+            measured.writer.filter(subscribers.is_filtered());
             if matches!(observation, Observation::AckNack(_))
                 && let Some(below) = subscribers.acknowledged_below()
             {

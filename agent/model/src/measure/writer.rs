@@ -107,6 +107,8 @@ pub struct Writer {
     exact: Option<ModelTime>,
     /// Whether the uprobe's view has ended, and no other view has shown a sample since.
     has_lost_view: bool,
+    /// Whether it applies a content filter of each reader to which its samples are seen to go.
+    is_filtered: bool,
 }
 
 /// Counters that settling changes.
@@ -142,7 +144,14 @@ impl Writer {
             sampled: None,
             exact: None,
             has_lost_view: false,
+            is_filtered: false,
         }
+    }
+
+    /// Sets whether it applies a content filter of each reader to which its samples are seen to go.
+    /// Missing samples are then irrelevant, because the filters may have rejected them.
+    pub const fn filter(&mut self, is_filtered: bool) {
+        self.is_filtered = is_filtered;
     }
 
     /// Updates the properties from discovery.
@@ -501,6 +510,7 @@ impl Writer {
             writer: self.guid,
             at,
             has_receivers,
+            is_filtered: self.is_filtered,
         };
         (&mut self.reception, settling)
     }
@@ -602,6 +612,7 @@ struct Settling<'a> {
     writer: Guid,
     at: ModelTime,
     has_receivers: bool,
+    is_filtered: bool,
 }
 
 impl Settling<'_> {
@@ -615,6 +626,10 @@ impl Settling<'_> {
             self.tally.irrelevant += 1;
             return;
         };
+        if self.is_filtered && !incomplete {
+            self.tally.irrelevant += last - first + 1;
+            return;
+        }
         self.tally.incomplete += u64::from(incomplete);
         self.journal.add_missing(Missing {
             writer: self.writer,

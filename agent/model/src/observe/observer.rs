@@ -673,6 +673,7 @@ impl Observer {
                         continue;
                     };
                     let has_buffers = endpoint.backends.is_some();
+                    let has_filter = endpoint.content_filter;
                     let topic = endpoint
                         .naming()
                         .and_then(|naming| self.graph.topics.find(endpoint.domain_id, &naming));
@@ -680,6 +681,7 @@ impl Observer {
                     if let Some(topic) = topic {
                         if let Some(topic) = self.graph.topics.get_mut(topic) {
                             topic.has_buffers |= has_buffers;
+                            topic.has_filters |= has_filter;
                         }
                         self.find_references(topic);
                     }
@@ -702,6 +704,7 @@ impl Observer {
         }
         let (role, message_type) = (endpoint.role, endpoint.message_type.clone());
         let has_buffers = endpoint.backends.is_some() || naming.is_buffer;
+        let has_filter = endpoint.content_filter;
         let (id, is_new) = self
             .graph
             .topics
@@ -709,6 +712,7 @@ impl Observer {
         if let Some(topic) = self.graph.topics.get_mut(id) {
             topic.last_type = Some(message_type);
             topic.has_buffers |= has_buffers;
+            topic.has_filters |= has_filter;
         }
         if is_new {
             self.graph.topics.shrink(self.settings.endpoints);
