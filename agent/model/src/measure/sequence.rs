@@ -168,6 +168,12 @@ impl Sequence {
         self.next
     }
 
+    /// Returns the newest source time of a sample, or zero.
+    #[must_use]
+    pub const fn newest_source(&self) -> Timestamp {
+        self.newest_source
+    }
+
     /// Returns the time at which the highest number last increased.
     #[must_use]
     pub const fn last_advance(&self) -> ModelTime {

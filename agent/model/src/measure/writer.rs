@@ -33,6 +33,8 @@ pub const BEST_EFFORT_WINDOW: Duration = Duration::from_secs(1);
 pub const RELIABLE_WINDOW: Duration = Duration::from_secs(10);
 /// A first sample older than this is history that a late joiner requested.
 const MIN_HISTORY_AGE: Duration = Duration::from_secs(10);
+/// A sample from before its reader appeared is history if it arrives within this time.
+const HISTORY_TIME: Duration = Duration::from_secs(1);
 
 /// A uprobe's view of a writer stays exact for this long after its last observation: samples read
 /// from shared memory in that time were seen already.
@@ -300,13 +302,14 @@ impl Writer {
         let at = context.now;
         let head = observation.head();
         let (is_exact, is_sampled) = (head.is_exact(), head.is_polled());
+        let is_history = self.traits.keeps_history && self.is_history(opened, observation, context);
         if is_exact {
             self.exact = self.exact.max(Some(at));
         }
         if let Observation::Sample(sample) = observation
             && self.is_pending(sample)
         {
-            return self.catch_up(sample, context);
+            return self.catch_up(sample, is_history, context);
         }
         if is_sampled && self.is_exact(at) {
             // The uprobe has reported the sample already, or will report it.
@@ -321,7 +324,8 @@ impl Writer {
                 _ => sampled.is_current(at),
             });
         if is_sampled || takes {
-            let counted = self.sampled_observation(observation, is_sampled, context);
+            let seen = (is_sampled, is_history);
+            let counted = self.sampled_observation(observation, seen, context);
             self.report_unseen(context.journal);
             if let Some(sampled) = self.sampled.as_mut().filter(|_| is_exact) {
                 // From now on, the uprobe sees every message.
@@ -338,7 +342,7 @@ impl Writer {
         }
         let mut counted = None;
         match observation {
-            Observation::Sample(sample) => counted = self.sample(sample, context),
+            Observation::Sample(sample) => counted = self.sample(sample, is_history, context),
             Observation::Heartbeat(heartbeat) => {
                 self.traits.reliable = true;
                 let (reception, mut settling) =
@@ -515,7 +519,12 @@ impl Writer {
         (&mut self.reception, settling)
     }
 
-    fn sample(&mut self, sample: &Sample, context: &mut MeasurementContext<'_>) -> Option<Counted> {
+    fn sample(
+        &mut self,
+        sample: &Sample,
+        is_history: bool,
+        context: &mut MeasurementContext<'_>,
+    ) -> Option<Counted> {
         let now = context.now;
         let reliable = self.traits.reliable;
         let (reception, mut settling) =
@@ -530,10 +539,10 @@ impl Writer {
                 self.tally.duplicates += u64::from(sample.head.path == Path::Wire);
             }
             Outcome::Complete(whole) if whole.is_message => {
-                self.count(now, whole.bytes, whole.recovered);
+                self.count(now, whole.bytes, whole.recovered, is_history);
                 let wall_clock = context.wall_clock.wall_time(now);
                 let (source, stamp) = (whole.source, whole.stamp);
-                if !whole.unconfirmed {
+                if !whole.unconfirmed && !is_history {
                     self.delays(
                         whole.number,
                         whole.newest,
@@ -579,16 +588,21 @@ impl Writer {
         last.is_some_and(|last| last + EXACT_FOR > now)
     }
 
-    fn count(&mut self, now: ModelTime, bytes: u64, recovered: bool) {
+    /// Counts a message. History for a new reader is left out of the rate.
+    fn count(&mut self, now: ModelTime, bytes: u64, recovered: bool, is_history: bool) {
         self.tally.messages += 1;
         self.tally.bytes += bytes;
         self.tally.recovered += u64::from(recovered);
         let slot = self.tally.window.second(now);
-        slot.messages += 1;
-        slot.bytes += bytes;
+        if !is_history {
+            slot.messages += 1;
+            slot.bytes += bytes;
+        }
         if let Some(previous) = self.last_message {
             let interval = seconds(now.nanoseconds_since(previous).max(0));
-            slot.longest_interval = slot.longest_interval.max(interval as f32);
+            if !is_history {
+                slot.longest_interval = slot.longest_interval.max(interval as f32);
+            }
             self.interarrival.observe(interval);
         }
         self.last_message = self.last_message.max(Some(now));
