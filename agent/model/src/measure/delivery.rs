@@ -325,7 +325,9 @@ impl Delivery {
     pub fn heartbeat(&mut self, heartbeat: &Heartbeat, context: &mut DeliveryContext<'_>) {
         self.note_seen(context.now);
         let end = heartbeat.last.next();
-        self.reception.sequence_mut().begin(end);
+        let sequence = self.reception.sequence_mut();
+        sequence.begin(end);
+        sequence.expect_history(heartbeat.first);
         if !self.uses_network {
             return;
         }

@@ -489,13 +489,7 @@ impl Sequence {
         }
         let undecided = end - self.settled;
         if undecided > self.received.len() && self.received.len() < MAX_WINDOW {
-            let len = undecided.next_power_of_two().min(MAX_WINDOW);
-            self.received.grow(len, self.floor(), self.next);
-            self.irrelevant.grow(len, self.floor(), self.next);
-            if let Some(mut elsewhere) = self.elsewhere.take() {
-                elsewhere.grow(len, self.floor(), self.next);
-                self.elsewhere = Some(elsewhere);
-            }
+            self.widen(undecided);
         }
         let keep = end.saturating_sub(self.received.len());
         if keep > self.settled {
@@ -513,6 +507,17 @@ impl Sequence {
         }
         self.next = end;
         self.last_advance = now;
+    }
+
+    /// Enlarges the window to this many numbers, up to [`MAX_WINDOW`].
+    fn widen(&mut self, numbers: u64) {
+        let len = numbers.min(MAX_WINDOW).next_power_of_two();
+        let (floor, next) = (self.floor(), self.next);
+        self.received.grow(len, floor, next);
+        self.irrelevant.grow(len, floor, next);
+        if let Some(elsewhere) = &mut self.elsewhere {
+            elsewhere.grow(len, floor, next);
+        }
     }
 
     fn note_gap(&mut self, start: SequenceNumber, end: SequenceNumber, now: ModelTime) {

@@ -176,6 +176,29 @@ fn samples_that_a_content_filter_rejects_are_lost_only_if_the_cause_is_known() {
 }
 
 #[test]
+fn a_history_of_thousands_of_samples_is_delivered_whole() {
+    for is_first_live in [false, true] {
+        let mut host = Host::new();
+        let bob = host.reader(BOB, 7411);
+        if is_first_live {
+            host.data(bob, 3000);
+        }
+        host.heartbeat(bob.directed(BOB), 1, 3000);
+        for number in (1..3000).chain(3000 + u64::from(is_first_live)..=3100) {
+            host.data(bob, number);
+            if number.is_multiple_of(100) {
+                host.wait(10);
+            }
+        }
+        (0..15).for_each(|_| host.wait(1000));
+        let facts = host.deliveries()[0].delivered;
+        let history = 3000 - u64::from(is_first_live);
+        assert_eq!((facts.messages, facts.history), (3100, history));
+        assert_eq!((facts.duplicates, facts.lost()), (0, 0));
+    }
+}
+
+#[test]
 fn a_hundred_thousand_samples_written_without_a_reader_are_lost_at_neither_end() {
     for is_sender in [false, true] {
         let mut host = Host::new();
