@@ -253,12 +253,13 @@ impl Subscribers {
         };
         self.totals.seen[1] = true;
         let source = sample.source_timestamp.timestamp();
-        let began = context.graph.wall_clock.wall_time(sample.head.began());
+        let wall_clock = context.graph.wall_clock;
+        let began = wall_clock.wall_time(sample.head.began());
         // Both times are from one clock. A sample that leaves before its timestamp, or hours after
         // it, is not a measure of the send delay.
         if let Some(source) = source.filter(|_| sample.is_start())
             && (source..=source + MAX_PLAUSIBLE_OFFSET).contains(&began)
-            && self.departures.is_first(source)
+            && self.departures.is_first(wall_clock.model_time(source))
         {
             let delay = began.nanoseconds_since(source);
             self.breakdown().send_delay.observe(seconds(delay));
