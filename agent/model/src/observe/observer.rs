@@ -274,7 +274,10 @@ impl Observer {
             }
             Input::Socket(facts) => self.graph.receivers.socket(facts),
             Input::SocketsRead => self.link_sessions(),
-            Input::SocketClosed(cookie) => self.graph.receivers.socket_closed(cookie),
+            Input::SocketClosed(cookie) => {
+                self.measure.links.forget(cookie);
+                self.graph.receivers.socket_closed(cookie);
+            }
             Input::SocketForgotten(cookie) => self.graph.receivers.socket_forgotten(cookie),
             Input::Inside(report) => self.report_inside(report),
             Input::InsideDetached => self.derive.inside.detach(),
