@@ -59,6 +59,7 @@ use crate::facts::watch::Watchlist;
 use crate::graph::discovery::{Caps, Change, Discovery, Endpoint, Memory, Priority};
 use crate::graph::discovery_fragments::DiscoveryFragments;
 use crate::graph::zenoh::{RestoredEndpoint, Zenoh};
+use crate::measure::history::TopicCounts;
 use crate::measure::latched::Latched;
 use crate::measure::links::Links;
 use crate::measure::payloads::Payloads;
@@ -467,8 +468,10 @@ impl Observer {
     pub fn measured(
         &self,
         now: Timestamp,
-    ) -> impl Iterator<Item = (DomainId, &DdsName, Measurement)> {
-        report::measured(self, self.graph.wall_clock.model_time(now))
+    ) -> TopicCounts<impl Iterator<Item = (DomainId, &DdsName, Measurement)>> {
+        let at = self.graph.wall_clock.model_time(now);
+        let topics = report::measured(self, at);
+        TopicCounts { at, topics }
     }
 
     /// Counts a parse failure. Callers that parse for the core report failures, too.
