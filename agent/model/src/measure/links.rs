@@ -15,8 +15,8 @@ use crate::graph::zenoh::{Flow, StreamId};
 
 /// Number of seconds over which the share of retransmitted segments is measured.
 const WINDOW_SECONDS: usize = 10;
-/// Time without a report after which a connection is forgotten whose end was not seen: longer than
-/// the pause between two retransmissions, at most 120 s on Linux, and than that between two
+/// Time without a report after which a connection is forgotten whose end was not seen. It is longer
+/// than the pause between two retransmissions, at most 120 s on Linux, and than that between two
 /// KEEP_ALIVEs.
 const MAX_SILENCE: Duration = Duration::from_secs(130);
 /// Time without a report after which a link is forgotten.
