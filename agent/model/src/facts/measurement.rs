@@ -100,7 +100,8 @@ pub struct Delivered {
     /// Samples and fragments that arrived more than once, without copies of an outgoing multicast.
     pub duplicates: u64,
     /// Samples that the writer skipped (GAP), that were written while this receiver had no reader,
-    /// or that its readers acknowledged although no copy was seen.
+    /// or that its readers acknowledged although no copy was seen. Also missing samples that the
+    /// writer may have rejected by the readers' content filters.
     pub irrelevant: u64,
     /// Samples that the sender dropped before its TCP connection.
     pub lost_at_sender: u64,

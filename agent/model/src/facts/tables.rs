@@ -37,10 +37,10 @@ crate::tables! {
     Checkpoints { name: "sequence.checkpoints", entries: 48 }
     /// Latest gaps in the sequence numbers of one writer
     SequenceGaps { name: "sequence.gaps", entries: 32, rule: Oldest }
-    /// Unconfirmed sequence numbers of one writer
+    /// Ranges of unconfirmed sequence numbers of one writer
     UnconfirmedNumbers {
         name: "sequence.unconfirmed", entries: 32, rule: Oldest,
-        effect: "the oldest is dropped and may count twice",
+        effect: "the oldest is dropped; its messages may count twice",
         reported: "`ros2_topic_doubted_sequence_jumps_total`",
     }
     /// Unfinished fragmented messages of one writer

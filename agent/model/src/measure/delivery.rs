@@ -29,15 +29,12 @@ use crate::facts::tables::WithheldLosses;
 use crate::measure::loss_causes::{LossCauses, reassembly_timeout};
 use crate::measure::reception::{CompleteSample, Outcome, Reception};
 use crate::measure::samples::Budget;
-use crate::measure::sequence::MAX_TRUSTED_JUMP;
+use crate::measure::sequence::{MAX_IRRELEVANT_AT_START, MAX_TRUSTED_JUMP};
 use crate::measure::undelivered::Undelivered;
 use crate::measure::writer::{BEST_EFFORT_WINDOW, settle_window};
 use accounting::Accounting;
 pub use accounting::Totals;
 
-/// Maximum number of samples, missed while there was no reader, that are marked irrelevant one by
-/// one. If there are more, the delivery restarts.
-const MAX_IRRELEVANT_AT_START: u64 = 512;
 /// Samples that left this host less than this ago may still arrive.
 const MAX_TRANSIT_TIME: Duration = Duration::from_secs(1);
 /// Samples that left for a receiver count as lost if it shows no sign of life for this time. Socket
@@ -95,6 +92,8 @@ pub struct Delivery {
     recent: RecentLoss,
     /// Whether all readers are best effort: they get no retransmissions and no HEARTBEATs.
     best_effort: bool,
+    /// Whether the writer applies a content filter of each reader.
+    is_filtered: bool,
     /// Whether samples use the network, at least for some readers, rather than only shared memory.
     uses_network: bool,
     /// The latest losses, while the delivery is withheld.
@@ -125,6 +124,7 @@ impl Delivery {
             overdue: 0,
             recent: RecentLoss::default(),
             best_effort: false,
+            is_filtered: false,
             uses_network: false,
             withheld: None,
             connection: None,
@@ -228,9 +228,17 @@ impl Delivery {
         self.reception.interrupt();
     }
 
-    /// Sets whether all readers are best effort.
-    pub const fn learn(&mut self, best_effort: bool) {
-        self.best_effort = best_effort;
+    /// Sets whether all readers are best effort, and whether the writer applies a content filter of
+    /// each. A missing sample without a known cause is then irrelevant, because the filter may have
+    /// rejected it.
+    pub const fn learn(&mut self, best_effort: bool, is_filtered: bool) {
+        (self.best_effort, self.is_filtered) = (best_effort, is_filtered);
+    }
+
+    /// Returns whether the writer applies a content filter of each reader.
+    #[must_use]
+    pub const fn is_filtered(&self) -> bool {
+        self.is_filtered
     }
 
     /// Records that the last reader is gone: samples after the last received one do not count as
@@ -317,7 +325,9 @@ impl Delivery {
     pub fn heartbeat(&mut self, heartbeat: &Heartbeat, context: &mut DeliveryContext<'_>) {
         self.note_seen(context.now);
         let end = heartbeat.last.next();
-        self.reception.sequence_mut().begin(end);
+        let sequence = self.reception.sequence_mut();
+        sequence.begin(end);
+        sequence.expect_history(heartbeat.first);
         if !self.uses_network {
             return;
         }
@@ -646,6 +656,7 @@ impl Delivery {
             writer: context.writer,
             receiver: self.receiver,
             main: self.main,
+            is_filtered: self.is_filtered,
             at: context.now,
             until,
             in_order_from: self

@@ -3,7 +3,7 @@
 
 use std::collections::VecDeque;
 
-use ros2probe_wire::{SequenceNumber, Timestamp};
+use ros2probe_wire::SequenceNumber;
 
 use crate::facts::bounded::Bounded;
 use crate::facts::model_time::ModelTime;
@@ -14,8 +14,9 @@ use crate::facts::tables::LatestDepartures;
 #[derive(Debug, Default)]
 pub struct Departures {
     latest: Bounded<LatestDepartures, VecDeque<Departure>>,
-    /// Source timestamp of the newest sample that began to leave.
-    newest: Timestamp,
+    /// Source time of the newest sample that began to leave. As model time, it stays comparable
+    /// after a step of the wall clock.
+    newest: ModelTime,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -26,9 +27,9 @@ struct Departure {
 }
 
 impl Departures {
-    /// Returns whether no datagram of the sample with this source timestamp has left before, to any
+    /// Returns whether no datagram of the sample with this source time has left before, to any
     /// destination or as a retransmission.
-    pub fn is_first(&mut self, source: Timestamp) -> bool {
+    pub fn is_first(&mut self, source: ModelTime) -> bool {
         let is_first = source > self.newest;
         self.newest = self.newest.max(source);
         is_first
@@ -64,7 +65,7 @@ mod tests {
             ..Destination::default()
         };
         for number in 1..=1000 {
-            let source = Timestamp(number);
+            let source = ModelTime::from_nanoseconds(number);
             assert!(departures.is_first(source) && !departures.is_first(source));
             departures.note(
                 SequenceNumber(number),

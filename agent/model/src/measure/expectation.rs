@@ -4,10 +4,12 @@
 //! `BAD` bad evaluations in a row and recovers after `EVALUATIONS_TO_RECOVER` good ones. Rates are
 //! evaluated over a window of at least three expected messages (1 to 10 s), or over the window of
 //! the entry. One message of tolerance at the window's edges keeps a healthy periodic topic stable.
-//! Silence has its own time and no hysteresis. A silence between two messages, which ended before
-//! it was evaluated, violates at once, and recovers as the others do. The end of a window counts
-//! for `min_rate_hz` only as far as its messages are known. The messages of a sampled topic are
-//! known once polling sees the next one.
+//! Latency is that of the last second. A second without a message keeps the verdict of the last two
+//! with messages, so that a slow topic needs two late ones. Silence has its own time and no
+//! hysteresis. A silence between two messages, which ended before it was evaluated, violates at
+//! once, and recovers as the others do. The end of a window counts for `min_rate_hz` only as far as
+//! its messages are known. The messages of a sampled topic are known once polling sees the next
+//! one.
 //!
 //! Windows and silences begin at the earliest when the agent can see the messages. That is after
 //! its own start, the first publisher or subscriber, and a time in which the source saw nothing. A
@@ -88,6 +90,8 @@ pub struct TopicEvaluation {
     good: u8,
     /// Evaluations until an interval counts again after a silence.
     ending: u8,
+    /// Number of consecutive seconds with messages whose latency was too high.
+    late: u8,
 }
 
 impl Evidence<'_> {
@@ -129,6 +133,7 @@ impl Default for TopicEvaluation {
             bad: 0,
             good: 0,
             ending: 0,
+            late: 0,
         }
     }
 }
@@ -159,7 +164,8 @@ impl TopicEvaluation {
     ) -> Option<Option<WatchState>> {
         let before = (!self.fresh).then_some(self.state);
         let is_silent = self.state == WatchState::Silent;
-        let broken = violated_bits(expectations, evidence, is_silent);
+        let broken = violated_bits(expectations, evidence, is_silent)
+            | self.latency_bit(expectations, evidence);
         let quiet = broken & MAX_SILENCE != 0 || evidence.last_message.is_none();
         let broken = without_subscriber_effects(broken, quiet, evidence);
         let silent = broken & MAX_SILENCE != 0;
@@ -211,6 +217,30 @@ impl TopicEvaluation {
         self.fresh = false;
         (before.unwrap_or(WatchState::Ok) != self.state).then_some(before)
     }
+
+    /// Returns [`MAX_LATENCY`] if the latency is too high, and 0 otherwise.
+    fn latency_bit(&mut self, expectations: &Expectations, evidence: &Evidence<'_>) -> u8 {
+        let Some(maximum) = expectations.max_latency else {
+            return 0;
+        };
+        let (slot, _) = (evidence.recent)(1);
+        let is_late = slot.delay > maximum.as_secs_f64() * f64::from(slot.delayed);
+        if slot.delayed > 0 {
+            self.late = match is_late {
+                true => self.late.saturating_add(1),
+                false => 0,
+            };
+            return if is_late { MAX_LATENCY } else { 0 };
+        }
+        if evidence.publishers == 0 || evidence.subscriptions == 0 {
+            // Nothing is sent any more.
+            self.late = 0;
+        }
+        match self.late >= EVALUATIONS_TO_VIOLATE {
+            true => MAX_LATENCY,
+            false => 0,
+        }
+    }
 }
 
 #[expect(
@@ -242,12 +272,6 @@ fn violated_bits(expectations: &Expectations, evidence: &Evidence<'_>, is_silent
         && evidence.loss.exceeds(maximum)
     {
         broken |= MAX_LOSS;
-    }
-    if let Some(maximum) = expectations.max_latency {
-        let (slot, _) = (evidence.recent)(1);
-        if slot.delayed > 0 && slot.delay > maximum.as_secs_f64() * f64::from(slot.delayed) {
-            broken |= MAX_LATENCY;
-        }
     }
     if let Some(maximum) = expectations.max_silence {
         let last = evidence.last_message.unwrap_or_default();
@@ -464,6 +488,36 @@ mod tests {
             violations,
             ["max_rate_hz", "max_loss_ratio", "max_latency_ms"]
         );
+    }
+
+    #[test]
+    fn two_late_messages_of_a_slow_topic_cause_a_violation_and_one_does_not() {
+        let mut bench = Bench::new(Expectations {
+            max_latency: Some(Duration::from_millis(50)),
+            ..Expectations::default()
+        });
+        let message = |delay: f64| Slot {
+            delayed: 1,
+            delay,
+            ..rate(1)
+        };
+        let (late, timely, none) = (message(3.0), message(0.01), rate(0));
+        let (ok, bad) = (WatchState::Ok, WatchState::Violated);
+        let seconds = [late, none, timely, none, late, none, none, late, none, none];
+        let states = seconds.map(|slot| bench.second(slot));
+        assert_eq!(states[..8], [ok; 8]);
+        assert_eq!(states[8..], [bad, bad]);
+        assert_eq!(bench.judgement.violations(), ["max_latency_ms"]);
+        let states = [timely, none, none].map(|slot| bench.second(slot));
+        assert_eq!(states, [bad, bad, ok]);
+        for slot in [late, none, late, none] {
+            bench.second(slot);
+        }
+        assert_eq!(bench.judgement.state(), bad);
+        // Nothing is sent without a subscription.
+        bench.subscriptions = 0;
+        let states = [none; 3].map(|slot| bench.second(slot));
+        assert_eq!(states[2], ok);
     }
 
     #[test]

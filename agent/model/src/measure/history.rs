@@ -15,6 +15,7 @@ use crate::facts::bounded::TableFacts;
 use crate::facts::bounded::{Bounded, Counted, Sum};
 use crate::facts::histogram::Histogram;
 use crate::facts::measurement::{EarlierCounts, Measurement};
+use crate::facts::model_time::ModelTime;
 use crate::facts::names::DdsName;
 use crate::facts::rate::SECONDS as WINDOW;
 use crate::facts::tables::{HistoryRows, HistorySeconds, HistoryTotals};
@@ -45,13 +46,24 @@ pub struct Past {
     seconds: Vec<Arc<Second>>,
 }
 
+/// The domain, DDS name and total counts of each topic at one time.
+#[derive(Debug)]
+pub struct TopicCounts<I> {
+    /// The time.
+    pub at: ModelTime,
+    /// The topics.
+    pub topics: I,
+}
+
 /// Measurements of one second.
 #[derive(Debug, Default)]
 pub struct Second {
     /// End of the second, by the source's clock.
     pub at: Timestamp,
-    /// Rows, sorted by topic.
-    rows: Box<[Row]>,
+    /// End of the second as model time, which steps of the source's clock do not change.
+    pub end: ModelTime,
+    /// Rows, sorted by topic. Seconds that differ only in `at` share them.
+    rows: Arc<[Row]>,
 }
 
 /// Measurements of one topic in one second.
@@ -134,17 +146,14 @@ impl History {
         now.0 > 0 && (now >= self.due() || is_back)
     }
 
-    /// Adds a second that ends at `now`, from the domain, DDS name and total counts of each topic.
+    /// Adds a second that ends at `now`, from the counts at that time.
     pub fn take<'a>(
         &mut self,
         now: Timestamp,
-        topics: impl Iterator<Item = (DomainId, &'a DdsName, Measurement)>,
+        counts: TopicCounts<impl Iterator<Item = (DomainId, &'a DdsName, Measurement)>>,
     ) {
-        if self.seconds.back().is_some_and(|last| now < last.at) {
-            // The clock was set back, and times within a chart must increase.
-            self.seconds.clear();
-            self.rows.clear();
-        }
+        let TopicCounts { at: end, topics } = counts;
+        self.follow_clock(now, end);
         let mut rows: Vec<Row> = Vec::new();
         let mut is_forgetful = true;
         for (domain_id, dds_name, counted) in topics {
@@ -159,8 +168,12 @@ impl History {
         }
         rows.sort_unstable_by_key(|row| row.topic);
         self.rows.add(rows.len());
-        let rows = rows.into();
-        let mut left = self.seconds.push_back(Arc::new(Second { at: now, rows }));
+        let second = Second {
+            at: now,
+            end,
+            rows: rows.into(),
+        };
+        let mut left = self.seconds.push_back(Arc::new(second));
         loop {
             self.rows.sub(left.map_or(0, |oldest| oldest.rows.len()));
             if !self.rows.is_exceeded() {
@@ -188,6 +201,28 @@ impl History {
             limit: self.most as u64,
             bytes: None,
             evictions: self.evictions,
+        }
+    }
+
+    /// Sets the times of earlier seconds back with the clock, because times within a chart must
+    /// increase. Drops these seconds if a source without a continuous time went back.
+    fn follow_clock(&mut self, now: Timestamp, end: ModelTime) {
+        let last = self.seconds.back().map(|last| (last.at, last.end));
+        let Some((last_at, last_end)) = last.filter(|(at, _)| now < *at) else {
+            return;
+        };
+        let Ok(passed) = u64::try_from(end.nanoseconds_since(last_end)) else {
+            self.seconds.clear();
+            self.rows.clear();
+            return;
+        };
+        let back = (last_at.0 - now.0).saturating_add(passed);
+        for second in &mut self.seconds {
+            *second = Arc::new(Second {
+                at: Timestamp(second.at.0.saturating_sub(back)),
+                end: second.end,
+                rows: Arc::clone(&second.rows),
+            });
         }
     }
 
@@ -279,6 +314,13 @@ impl Past {
         &self.seconds
     }
 
+    /// Returns the seconds that ended after this time, oldest first.
+    #[must_use]
+    pub fn since(&self, end: ModelTime) -> &[Arc<Second>] {
+        let first = self.seconds.partition_point(|second| second.end <= end);
+        self.seconds.get(first..).unwrap_or_default()
+    }
+
     /// Returns one second of a topic, with its rates over the window that ends there; `None` if it
     /// was not measured.
     fn reading(&self, place: usize, id: u32) -> Option<Reading> {
@@ -290,7 +332,7 @@ impl Past {
         for second in self.seconds.get(first..=place).unwrap_or_default() {
             let Some(row) = second.row(id) else {
                 // The topic was not measured in this second, so the sums begin again.
-                (messages, bytes, began) = (0.0, 0.0, Some(second.at));
+                (messages, bytes, began) = (0.0, 0.0, Some(second.end));
                 continue;
             };
             // The first second only marks the beginning of the next one.
@@ -298,11 +340,11 @@ impl Past {
                 messages += f64::from(row.messages);
                 bytes += f64::from(row.bytes);
             } else {
-                began = Some(second.at);
+                began = Some(second.end);
             }
         }
-        let at = self.seconds.get(place)?.at;
-        let seconds = at.seconds() - began.unwrap_or(at).seconds();
+        let end = self.seconds.get(place)?.end;
+        let seconds = (end - began.unwrap_or(end)).as_secs_f64();
         let per_second = |sum: f64| (seconds > 0.0).then(|| sum / seconds);
         Some(Reading {
             row,
@@ -452,7 +494,8 @@ mod tests {
         let topics = topics
             .iter()
             .map(|(name, counted)| (DomainId(0), *name, counted.clone()));
-        history.take(Timestamp(second * SECOND), topics);
+        let at = ModelTime::of_second(second);
+        history.take(Timestamp(second * SECOND), TopicCounts { at, topics });
         assert!(!history.rows.is_exceeded());
     }
 
@@ -570,7 +613,8 @@ mod tests {
             let topics = names
                 .iter()
                 .map(|name| (DomainId(0), name, Measurement::default()));
-            history.take(Timestamp(second * SECOND), topics);
+            let at = ModelTime::of_second(second);
+            history.take(Timestamp(second * SECOND), TopicCounts { at, topics });
         }
         assert_eq!(history.past().seconds().len(), 13);
         assert_eq!(history.rows.used(), 13 * 20_000);
@@ -599,7 +643,31 @@ mod tests {
     }
 
     #[test]
-    fn a_clock_that_is_set_back_clears_the_history() {
+    fn steps_of_the_clock_change_no_rate_and_drop_no_second() {
+        let hour = 3600 * SECOND.cast_signed();
+        for step in [-hour, -SECOND.cast_signed() * 3 / 2, -5_000_000, hour] {
+            let points = name("rt/points");
+            let mut history = History::new(Duration::from_secs(600), 2);
+            for second in 0..20 {
+                let at = ModelTime::of_second(100_000 + second);
+                let step = if second < 10 { 0 } else { step };
+                let now = Timestamp(at.nanoseconds().saturating_add_signed(step));
+                let topics = [(DomainId(0), &points, counted(10 * second, 0, &[]))].into_iter();
+                history.take(now, TopicCounts { at, topics });
+            }
+            let past = history.past();
+            let seen: Vec<_> = past.topic(DomainId(0), "rt/points").unwrap().collect();
+            assert_eq!(seen.len(), 20, "{step}");
+            assert!(seen.is_sorted_by(|one, next| one.0 < next.0), "{step}");
+            let mut rates = seen.iter().map(|(_, reading)| reading.unwrap().rate_hz);
+            assert_eq!(rates.next(), Some(None));
+            assert!(rates.all(|rate| rate == Some(10.0)), "{step}");
+            assert_eq!(past.since(ModelTime::of_second(100_015)).len(), 4);
+        }
+    }
+
+    #[test]
+    fn a_source_that_goes_back_clears_the_history() {
         let (mut history, points) = (History::new(Duration::from_secs(600), 2), name("rt/points"));
         take(&mut history, 100, &[(&points, counted(1, 0, &[]))]);
         assert!(!history.is_due(Timestamp(100 * SECOND + 5)));

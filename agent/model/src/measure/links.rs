@@ -11,12 +11,13 @@ use crate::facts::diagnosis::Diagnosis;
 use crate::facts::link::{LinkKey, LinkProtocol};
 use crate::facts::model_time::ModelTime;
 use crate::facts::tables::{LinkConnections, TcpLinks};
-use crate::graph::zenoh::Flow;
+use crate::graph::zenoh::{Flow, StreamId};
 
 /// Number of seconds over which the share of retransmitted segments is measured.
 const WINDOW_SECONDS: usize = 10;
-/// Time without a report after which a connection is forgotten: longer than the pause between two
-/// retransmissions, at most 120 s on Linux, and than that between two KEEP_ALIVEs.
+/// Time without a report after which a connection is forgotten whose end was not seen. It is longer
+/// than the pause between two retransmissions, at most 120 s on Linux, and than that between two
+/// KEEP_ALIVEs.
 const MAX_SILENCE: Duration = Duration::from_secs(130);
 /// Time without a report after which a link is forgotten.
 const LINK_TIMEOUT: Duration = Duration::from_secs(600);
@@ -148,6 +149,18 @@ impl Links {
         self.connections.insert(id, connection);
     }
 
+    /// Forgets the connection of a socket that was closed.
+    pub fn forget(&mut self, socket: u64) {
+        self.connections.retain(|(known, _), _| *known != socket);
+    }
+
+    /// Forgets the connection of a stream whose sender, this host or the other, has closed it.
+    pub fn end(&mut self, stream: &StreamId) {
+        for flow in [stream.flow, stream.flow.reversed()] {
+            self.connections.remove(&(stream.socket, flow));
+        }
+    }
+
     /// Ends a second: determines which links are lossy, and forgets what is gone.
     pub fn end_second(&mut self, now: ModelTime) {
         self.connections
@@ -269,6 +282,26 @@ mod tests {
             (links.facts()[1].sent, links.facts()[1].retransmitted),
             (10, 1)
         );
+    }
+
+    #[test]
+    fn a_connection_that_either_end_closes_is_forgotten_at_once() {
+        let mut links = Links::default();
+        (1..=4).for_each(|port| links.report(&report(port, 2, 1, 0), at(0)));
+        let connections = |links: &Links| links.facts()[0].connections;
+        links.forget(1);
+        assert_eq!(connections(&links), 3);
+        let stream = |socket, flow| StreamId {
+            flow,
+            socket,
+            ..StreamId::default()
+        };
+        links.end(&stream(2, report(2, 2, 1, 0).flow));
+        links.end(&stream(3, report(3, 2, 1, 0).flow.reversed()));
+        assert_eq!(connections(&links), 1);
+        // Another socket does not end the connection.
+        links.end(&stream(9, report(4, 2, 1, 0).flow));
+        assert_eq!(connections(&links), 1);
     }
 
     #[test]

@@ -34,8 +34,15 @@ pub use unknown_writers::UnknownWriters;
 /// An unknown writer is shown and metered after this time; announcements usually arrive within a
 /// second.
 const UNKNOWN_AFTER: Duration = Duration::from_secs(3);
-/// An unknown writer is dropped after this silence, or earlier if it sent little.
+/// An unknown writer is dropped after this silence, or earlier if the table is full and it sent
+/// little. A slow one is dropped after [`SILENT_INTERVALS`].
 const UNKNOWN_WRITER_TIMEOUT: Duration = Duration::from_secs(30);
+/// Minimum silence after which an unknown writer of a known participant is dropped, until it is
+/// established: its interval may be long.
+const SLOW_WRITER_TIMEOUT: Duration = Duration::from_secs(120);
+/// Number of mean intervals of an unknown writer after which it is dropped, at most an hour.
+const SILENT_INTERVALS: u32 = 4;
+const LONGEST_SILENCE: Duration = Duration::from_secs(3600);
 const EVICTABLE_AFTER: Duration = Duration::from_secs(3);
 /// Minimum number of messages of an unknown writer that is never evicted.
 const ESTABLISHED_MESSAGES: u64 = 10;
@@ -66,6 +73,8 @@ pub struct Measured {
     pub metered: bool,
     /// Cookie of the socket through which an unknown writer sends; 0 if not known.
     pub socket: u64,
+    /// Whether the participant of an unknown writer was known at its first message.
+    has_participant: bool,
     opened: ModelTime,
     /// Whether the wait for a gap ended without an ACKNACK.
     unacknowledged: bool,
@@ -251,6 +260,7 @@ impl Profiler {
                 .subscribers
                 .get_or_insert_with(|| Box::new(Subscribers::new(measured.complete_from)));
             novelty = subscribers.observe(observation, &mut context);
+            measured.writer.filter(subscribers.is_filtered());
             if matches!(observation, Observation::AckNack(_))
                 && let Some(below) = subscribers.acknowledged_below()
             {
@@ -629,6 +639,7 @@ impl Measured {
             last_seen: now,
             metered: false,
             socket: 0,
+            has_participant: false,
             opened: ModelTime::ZERO,
             unacknowledged: false,
             complete_from: ModelTime::ZERO,
@@ -641,11 +652,26 @@ impl Measured {
     fn next_due(&self, now: ModelTime) -> ModelTime {
         let own = self.writer.next_due();
         own.min(match (self.topic, &self.subscribers) {
-            (None, _) if self.metered => self.last_seen + UNKNOWN_WRITER_TIMEOUT,
+            (None, _) if self.metered => self.last_seen + self.silence_timeout(),
             (None, _) => self.first_seen + UNKNOWN_AFTER,
             (Some(_), Some(known)) => known.next_due(self.writer.traits().reliable, now),
             (Some(_), None) => ModelTime::MAX,
         })
+    }
+
+    /// Returns the silence after which it is dropped as an unknown writer.
+    fn silence_timeout(&self) -> Duration {
+        let messages = self.writer.messages();
+        let least = match self.has_participant && messages < ESTABLISHED_MESSAGES {
+            true => SLOW_WRITER_TIMEOUT,
+            false => UNKNOWN_WRITER_TIMEOUT,
+        };
+        let Some(last) = self.writer.last_message().filter(|_| messages > 1) else {
+            return least;
+        };
+        let intervals = u32::try_from(messages - 1).unwrap_or(u32::MAX);
+        let mean = (last - self.first_seen) / intervals;
+        (SILENT_INTERVALS * mean).clamp(least, LONGEST_SILENCE)
     }
 
     /// Allows samples to lack fragments until the kernel knows the writer.

@@ -280,11 +280,16 @@ impl Reception {
         numbers.min(self.samples.next_expiry(2 * window))
     }
 
-    /// Decides all samples at the end of the input.
-    pub fn settle(&mut self, budget: &mut Budget, decide: &mut impl FnMut(Decision)) {
+    /// Decides all samples up to the highest number known to exist.
+    pub fn settle_known(&mut self, budget: &mut Budget, decide: &mut impl FnMut(Decision)) {
         let Self { sequence, samples } = self;
         sequence.settle_all(&mut |settled| decide(decision(settled, samples, budget)));
-        samples.clear(budget);
+    }
+
+    /// Decides all samples at the end of the input.
+    pub fn settle(&mut self, budget: &mut Budget, decide: &mut impl FnMut(Decision)) {
+        self.settle_known(budget, decide);
+        self.samples.clear(budget);
     }
 
     fn data(

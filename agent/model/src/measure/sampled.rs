@@ -12,7 +12,7 @@ use ros2probe_wire::{SequenceNumber, Timestamp};
 
 use crate::facts::measurement::SampledFacts;
 use crate::facts::model_time::ModelTime;
-use crate::measure::sequence::{MAX_WINDOW, Run, RunMembership, Sequence};
+use crate::measure::sequence::{MAX_WINDOW, NumberRange, Run, RunMembership, Sequence};
 
 /// A writer that was not seen in shared memory for this long is no longer sampled.
 const SAMPLED_TIMEOUT: Duration = Duration::from_secs(10);
@@ -339,7 +339,7 @@ impl Sampled {
             self.begin(sequence.next(), now);
             self.arrived = None;
         }
-        let end = run.numbers.iter().map(|(number, _)| *number).max();
+        let end = run.ranges.iter().map(|range| range.last).max();
         let end = end.unwrap_or_default().max(number).next();
         let samples = self.advance(end, true, now, sequence);
         let samples = self.confirm(&run, samples);
@@ -459,14 +459,17 @@ impl Sampled {
     /// Marks the samples of a confirmed run as seen. Returns how many of `samples` new numbers were
     /// not counted while the run was unconfirmed.
     fn confirm(&mut self, run: &Run, samples: u64) -> u64 {
-        for &(number, is_whole) in &run.numbers {
-            let bit = self.bit(number, self.next).unwrap_or(0);
-            self.seen_bits |= bit;
-            if is_whole {
-                self.finished |= bit;
+        for range in &run.ranges {
+            for number in range.first.until(range.last.next()) {
+                let bit = self.bit(number, self.next).unwrap_or(0);
+                self.seen_bits |= bit;
+                if range.is_whole {
+                    self.finished |= bit;
+                }
             }
         }
-        samples.saturating_sub(run.numbers.len() as u64)
+        let counted: u64 = run.ranges.iter().map(NumberRange::count).sum();
+        samples.saturating_sub(counted)
     }
 
     /// Marks a sample as seen. Returns whether this ends the wait for the sample.

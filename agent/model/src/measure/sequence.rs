@@ -21,7 +21,7 @@ use crate::facts::bounded::Bounded;
 use crate::facts::model_time::ModelTime;
 use crate::facts::tables::{Checkpoints, SequenceGaps};
 use bitmap::Bitmap;
-pub use unconfirmed::Run;
+pub use unconfirmed::{NumberRange, Run};
 use unconfirmed::{REQUIRED_CONFIRMATIONS, UnconfirmedRun};
 
 /// Initial size of the window: the undecided and recently decided numbers that are remembered.
@@ -45,6 +45,9 @@ pub const MIN_INCARNATION_GAP: Duration = Duration::from_millis(100);
 /// This many consecutive samples below the window also begin a new incarnation, whatever their
 /// source times.
 const MAX_STALE: u32 = 1024;
+/// Maximum number of samples without a reader that are marked irrelevant. If a run skips more, it
+/// restarts the numbers.
+pub const MAX_IRRELEVANT_AT_START: u64 = 512;
 /// Number of steps per window in which settling advances.
 const SETTLING_STEPS: u32 = 16;
 
@@ -85,6 +88,8 @@ pub struct Sequence {
     last_advance: ModelTime,
     /// Number of samples that continued this incarnation, at most 255.
     followed: u8,
+    /// Whether samples became visible after `last_advance`.
+    is_reopened: bool,
     unconfirmed: Option<Box<UnconfirmedRun>>,
     /// Number of runs, HEARTBEATs, GAPs and ACKNACKs that were unconfirmed.
     jumps: u64,
@@ -161,6 +166,12 @@ impl Sequence {
     #[must_use]
     pub const fn next(&self) -> SequenceNumber {
         self.next
+    }
+
+    /// Returns the newest source time of a sample, or zero.
+    #[must_use]
+    pub const fn newest_source(&self) -> Timestamp {
+        self.newest_source
     }
 
     /// Returns the time at which the highest number last increased.
@@ -431,6 +442,12 @@ impl Sequence {
         times.into_iter().flatten().min().unwrap_or(ModelTime::MAX)
     }
 
+    /// Sets whether samples became visible after [`Self::last_advance`]. A run that begins far ahead
+    /// then restarts the numbers, because the numbers between may belong to other samples.
+    pub const fn reopen(&mut self, is_reopened: bool) {
+        self.is_reopened = is_reopened;
+    }
+
     /// Decides all open numbers.
     pub fn settle_all(&mut self, settled: &mut impl FnMut(Settled)) {
         self.settle(self.next, settled);
@@ -472,13 +489,7 @@ impl Sequence {
         }
         let undecided = end - self.settled;
         if undecided > self.received.len() && self.received.len() < MAX_WINDOW {
-            let len = undecided.next_power_of_two().min(MAX_WINDOW);
-            self.received.grow(len, self.floor(), self.next);
-            self.irrelevant.grow(len, self.floor(), self.next);
-            if let Some(mut elsewhere) = self.elsewhere.take() {
-                elsewhere.grow(len, self.floor(), self.next);
-                self.elsewhere = Some(elsewhere);
-            }
+            self.widen(undecided);
         }
         let keep = end.saturating_sub(self.received.len());
         if keep > self.settled {
@@ -496,6 +507,17 @@ impl Sequence {
         }
         self.next = end;
         self.last_advance = now;
+    }
+
+    /// Enlarges the window to this many numbers, up to [`MAX_WINDOW`].
+    fn widen(&mut self, numbers: u64) {
+        let len = numbers.min(MAX_WINDOW).next_power_of_two();
+        let (floor, next) = (self.floor(), self.next);
+        self.received.grow(len, floor, next);
+        self.irrelevant.grow(len, floor, next);
+        if let Some(elsewhere) = &mut self.elsewhere {
+            elsewhere.grow(len, floor, next);
+        }
     }
 
     fn note_gap(&mut self, start: SequenceNumber, end: SequenceNumber, now: ModelTime) {

@@ -20,7 +20,7 @@ mod lifecycle;
 mod receivers;
 mod submessages;
 
-use ros2probe_wire::{Guid, SequenceNumber};
+use ros2probe_wire::{Guid, GuidPrefix, SequenceNumber};
 
 use crate::facts::header::MAX_PLAUSIBLE_OFFSET;
 use crate::facts::journal::Journal;
@@ -60,6 +60,9 @@ pub struct Subscribers {
     at_socket: bool,
     /// Whether any participant has a reader that matches the writer.
     has_readers: bool,
+    /// Whether the writer applies a content filter of each reader to which its samples are seen to
+    /// go.
+    is_filtered: bool,
     /// Losses in this second of the worst receiver that is gone.
     departed: LossShare,
     /// Generation of the results in `routes`.
@@ -147,6 +150,13 @@ impl Subscribers {
     #[must_use]
     pub const fn totals(&self) -> &Totals {
         &self.totals
+    }
+
+    /// Returns whether the writer applies a content filter of each reader to which its samples are
+    /// seen to go.
+    #[must_use]
+    pub const fn is_filtered(&self) -> bool {
+        self.is_filtered
     }
 
     /// Returns the number of routes and readers that were refused.
@@ -243,12 +253,13 @@ impl Subscribers {
         };
         self.totals.seen[1] = true;
         let source = sample.source_timestamp.timestamp();
-        let began = context.graph.wall_clock.wall_time(sample.head.began());
+        let wall_clock = context.graph.wall_clock;
+        let began = wall_clock.wall_time(sample.head.began());
         // Both times are from one clock. A sample that leaves before its timestamp, or hours after
         // it, is not a measure of the send delay.
         if let Some(source) = source.filter(|_| sample.is_start())
             && (source..=source + MAX_PLAUSIBLE_OFFSET).contains(&began)
-            && self.departures.is_first(source)
+            && self.departures.is_first(wall_clock.model_time(source))
         {
             let delay = began.nanoseconds_since(source);
             self.breakdown().send_delay.observe(seconds(delay));
@@ -523,7 +534,7 @@ impl Subscribers {
         if cached.is_some() {
             return cached;
         }
-        let (route, is_shared) = (known.route, known.is_shared);
+        let (route, is_shared, owner) = (known.route, known.is_shared, known.owner);
         let place = match self.find(receiver) {
             Some(place) => place,
             None if context.quota.used >= context.quota.limit => {
@@ -534,13 +545,16 @@ impl Subscribers {
             None => {
                 context.quota.used += 1;
                 let mut delivery = Delivery::new(receiver, route, context.now);
-                delivery.learn(is_best_effort(receiver, context.readers()));
+                let readers = context.readers();
+                let is_filtered = readers.are_filtered(addressee(receiver, owner));
+                delivery.learn(is_best_effort(receiver, readers), is_filtered);
                 delivery.allow_incomplete(self.sure_from);
                 if is_unknown(receiver) && !is_shared {
                     delivery.withhold();
                 }
                 self.deliveries.push(delivery);
                 self.count_open();
+                self.note_filters();
                 self.deliveries.len() - 1
             }
         };
@@ -552,6 +566,11 @@ impl Subscribers {
 
     fn count_open(&mut self) {
         self.open = self.deliveries.iter().filter(|each| is_open(each)).count();
+    }
+
+    fn note_filters(&mut self) {
+        let mut deliveries = self.deliveries.iter();
+        self.is_filtered = !self.deliveries.is_empty() && deliveries.all(Delivery::is_filtered);
     }
 
     fn breakdown(&mut self) -> &mut Breakdown {
@@ -588,6 +607,14 @@ const fn is_unknown(receiver: Receiver) -> bool {
 /// Returns whether the receiver has matching readers, all of them best effort.
 fn is_best_effort(receiver: Receiver, readers: MatchedReaders<'_>) -> bool {
     matches!(receiver, Receiver::Participant(prefix) if readers.are_best_effort(prefix))
+}
+
+/// Returns the participant of the receiver; that of its route is `owner`, if known.
+const fn addressee(receiver: Receiver, owner: Option<GuidPrefix>) -> Option<GuidPrefix> {
+    match receiver {
+        Receiver::Participant(prefix) => Some(prefix),
+        Receiver::Route(_) => owner,
+    }
 }
 
 fn is_reader(topic: &Topic, guid: Guid) -> bool {

@@ -77,6 +77,8 @@ pub struct Topic {
     pub is_held: bool,
     /// Whether one of its endpoints accepted buffers.
     pub has_buffers: bool,
+    /// Whether one of its readers announced a content filter.
+    pub has_filters: bool,
 }
 
 /// The subscriptions of a publisher that accept buffers of other backends than `cpu`.
@@ -484,6 +486,7 @@ impl Topics {
                 vanished: None,
                 is_held: false,
                 has_buffers: false,
+                has_filters: false,
             }),
         );
         id

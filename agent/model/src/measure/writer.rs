@@ -25,7 +25,7 @@ use crate::measure::in_order::Progress;
 use crate::measure::reception::{Decision, Outcome, Reception};
 use crate::measure::sampled::Sampled;
 use crate::measure::samples::Budget;
-use crate::measure::sequence::{MAX_ANNOUNCED_JUMP, MAX_TRUSTED_JUMP};
+use crate::measure::sequence::{MAX_ANNOUNCED_JUMP, MAX_IRRELEVANT_AT_START, MAX_TRUSTED_JUMP};
 
 /// Time in which reordering may fill a gap of a best-effort writer.
 pub const BEST_EFFORT_WINDOW: Duration = Duration::from_secs(1);
@@ -33,6 +33,8 @@ pub const BEST_EFFORT_WINDOW: Duration = Duration::from_secs(1);
 pub const RELIABLE_WINDOW: Duration = Duration::from_secs(10);
 /// A first sample older than this is history that a late joiner requested.
 const MIN_HISTORY_AGE: Duration = Duration::from_secs(10);
+/// A sample from before its reader appeared is history if it arrives within this time.
+const HISTORY_TIME: Duration = Duration::from_secs(1);
 
 /// A uprobe's view of a writer stays exact for this long after its last observation: samples read
 /// from shared memory in that time were seen already.
@@ -107,6 +109,8 @@ pub struct Writer {
     exact: Option<ModelTime>,
     /// Whether the uprobe's view has ended, and no other view has shown a sample since.
     has_lost_view: bool,
+    /// Whether it applies a content filter of each reader to which its samples are seen to go.
+    is_filtered: bool,
 }
 
 /// Counters that settling changes.
@@ -142,7 +146,14 @@ impl Writer {
             sampled: None,
             exact: None,
             has_lost_view: false,
+            is_filtered: false,
         }
+    }
+
+    /// Sets whether it applies a content filter of each reader to which its samples are seen to go.
+    /// Missing samples are then irrelevant, because the filters may have rejected them.
+    pub const fn filter(&mut self, is_filtered: bool) {
+        self.is_filtered = is_filtered;
     }
 
     /// Updates the properties from discovery.
@@ -291,13 +302,14 @@ impl Writer {
         let at = context.now;
         let head = observation.head();
         let (is_exact, is_sampled) = (head.is_exact(), head.is_polled());
+        let is_history = self.traits.keeps_history && self.is_history(opened, observation, context);
         if is_exact {
             self.exact = self.exact.max(Some(at));
         }
         if let Observation::Sample(sample) = observation
             && self.is_pending(sample)
         {
-            return self.catch_up(sample, context);
+            return self.catch_up(sample, is_history, context);
         }
         if is_sampled && self.is_exact(at) {
             // The uprobe has reported the sample already, or will report it.
@@ -312,7 +324,8 @@ impl Writer {
                 _ => sampled.is_current(at),
             });
         if is_sampled || takes {
-            let counted = self.sampled_observation(observation, is_sampled, context);
+            let seen = (is_sampled, is_history);
+            let counted = self.sampled_observation(observation, seen, context);
             self.report_unseen(context.journal);
             if let Some(sampled) = self.sampled.as_mut().filter(|_| is_exact) {
                 // From now on, the uprobe sees every message.
@@ -320,11 +333,16 @@ impl Writer {
             }
             return counted;
         }
-        let sequence = self.reception.sequence();
-        let before = (sequence.next(), sequence.last_advance());
+        let sequence = self.reception.sequence_mut();
+        let next = sequence.next();
+        let is_reopened = sequence.last_advance() < opened;
+        sequence.reopen(is_reopened);
+        if is_reopened && let Observation::Sample(sample) = observation {
+            self.settle_before(sample.sequence_number, context);
+        }
         let mut counted = None;
         match observation {
-            Observation::Sample(sample) => counted = self.sample(sample, context),
+            Observation::Sample(sample) => counted = self.sample(sample, is_history, context),
             Observation::Heartbeat(heartbeat) => {
                 self.traits.reliable = true;
                 let (reception, mut settling) =
@@ -346,9 +364,8 @@ impl Writer {
             }
             Observation::Presence(_) => {}
         }
-        let (next, advanced) = before;
         let sequence = self.reception.sequence_mut();
-        if next > SequenceNumber::ZERO && advanced < opened && sequence.next() > next {
+        if next > SequenceNumber::ZERO && is_reopened && sequence.next() > next {
             // The newest sample is marked irrelevant too, which has no effect once it is received.
             sequence.mark_irrelevant(next, sequence.next());
         }
@@ -497,11 +514,17 @@ impl Writer {
             writer: self.guid,
             at,
             has_receivers,
+            is_filtered: self.is_filtered,
         };
         (&mut self.reception, settling)
     }
 
-    fn sample(&mut self, sample: &Sample, context: &mut MeasurementContext<'_>) -> Option<Counted> {
+    fn sample(
+        &mut self,
+        sample: &Sample,
+        is_history: bool,
+        context: &mut MeasurementContext<'_>,
+    ) -> Option<Counted> {
         let now = context.now;
         let reliable = self.traits.reliable;
         let (reception, mut settling) =
@@ -516,10 +539,10 @@ impl Writer {
                 self.tally.duplicates += u64::from(sample.head.path == Path::Wire);
             }
             Outcome::Complete(whole) if whole.is_message => {
-                self.count(now, whole.bytes, whole.recovered);
+                self.count(now, whole.bytes, whole.recovered, is_history);
                 let wall_clock = context.wall_clock.wall_time(now);
                 let (source, stamp) = (whole.source, whole.stamp);
-                if !whole.unconfirmed {
+                if !whole.unconfirmed && !is_history {
                     self.delays(
                         whole.number,
                         whole.newest,
@@ -543,6 +566,16 @@ impl Writer {
         None
     }
 
+    /// Decides all known samples if the numbers may restart at `number`, far ahead of them.
+    fn settle_before(&mut self, number: SequenceNumber, context: &mut MeasurementContext<'_>) {
+        let next = self.reception.sequence().next();
+        if number.steps_since(next) > MAX_IRRELEVANT_AT_START {
+            let (reception, mut settling) =
+                self.parts(context.journal, (context.now, context.has_receivers));
+            reception.settle_known(context.budget, &mut |decision| settling.take(decision));
+        }
+    }
+
     /// Returns whether the number of this DATA or DATA_FRAG is outside the writer's live run.
     fn is_unconfirmed(&self, sample: &Sample) -> bool {
         let source = sample.source_timestamp.timestamp();
@@ -555,16 +588,21 @@ impl Writer {
         last.is_some_and(|last| last + EXACT_FOR > now)
     }
 
-    fn count(&mut self, now: ModelTime, bytes: u64, recovered: bool) {
+    /// Counts a message. History for a new reader is left out of the rate.
+    fn count(&mut self, now: ModelTime, bytes: u64, recovered: bool, is_history: bool) {
         self.tally.messages += 1;
         self.tally.bytes += bytes;
         self.tally.recovered += u64::from(recovered);
         let slot = self.tally.window.second(now);
-        slot.messages += 1;
-        slot.bytes += bytes;
+        if !is_history {
+            slot.messages += 1;
+            slot.bytes += bytes;
+        }
         if let Some(previous) = self.last_message {
             let interval = seconds(now.nanoseconds_since(previous).max(0));
-            slot.longest_interval = slot.longest_interval.max(interval as f32);
+            if !is_history {
+                slot.longest_interval = slot.longest_interval.max(interval as f32);
+            }
             self.interarrival.observe(interval);
         }
         self.last_message = self.last_message.max(Some(now));
@@ -588,6 +626,7 @@ struct Settling<'a> {
     writer: Guid,
     at: ModelTime,
     has_receivers: bool,
+    is_filtered: bool,
 }
 
 impl Settling<'_> {
@@ -601,6 +640,10 @@ impl Settling<'_> {
             self.tally.irrelevant += 1;
             return;
         };
+        if self.is_filtered && !incomplete {
+            self.tally.irrelevant += last - first + 1;
+            return;
+        }
         self.tally.incomplete += u64::from(incomplete);
         self.journal.add_missing(Missing {
             writer: self.writer,

@@ -59,6 +59,7 @@ use crate::facts::watch::Watchlist;
 use crate::graph::discovery::{Caps, Change, Discovery, Endpoint, Memory, Priority};
 use crate::graph::discovery_fragments::DiscoveryFragments;
 use crate::graph::zenoh::{RestoredEndpoint, Zenoh};
+use crate::measure::history::TopicCounts;
 use crate::measure::latched::Latched;
 use crate::measure::links::Links;
 use crate::measure::payloads::Payloads;
@@ -274,7 +275,10 @@ impl Observer {
             }
             Input::Socket(facts) => self.graph.receivers.socket(facts),
             Input::SocketsRead => self.link_sessions(),
-            Input::SocketClosed(cookie) => self.graph.receivers.socket_closed(cookie),
+            Input::SocketClosed(cookie) => {
+                self.measure.links.forget(cookie);
+                self.graph.receivers.socket_closed(cookie);
+            }
             Input::SocketForgotten(cookie) => self.graph.receivers.socket_forgotten(cookie),
             Input::Inside(report) => self.report_inside(report),
             Input::InsideDetached => self.derive.inside.detach(),
@@ -464,8 +468,10 @@ impl Observer {
     pub fn measured(
         &self,
         now: Timestamp,
-    ) -> impl Iterator<Item = (DomainId, &DdsName, Measurement)> {
-        report::measured(self, self.graph.wall_clock.model_time(now))
+    ) -> TopicCounts<impl Iterator<Item = (DomainId, &DdsName, Measurement)>> {
+        let at = self.graph.wall_clock.model_time(now);
+        let topics = report::measured(self, at);
+        TopicCounts { at, topics }
     }
 
     /// Counts a parse failure. Callers that parse for the core report failures, too.
@@ -673,6 +679,7 @@ impl Observer {
                         continue;
                     };
                     let has_buffers = endpoint.backends.is_some();
+                    let has_filter = endpoint.content_filter;
                     let topic = endpoint
                         .naming()
                         .and_then(|naming| self.graph.topics.find(endpoint.domain_id, &naming));
@@ -680,6 +687,7 @@ impl Observer {
                     if let Some(topic) = topic {
                         if let Some(topic) = self.graph.topics.get_mut(topic) {
                             topic.has_buffers |= has_buffers;
+                            topic.has_filters |= has_filter;
                         }
                         self.find_references(topic);
                     }
@@ -702,6 +710,7 @@ impl Observer {
         }
         let (role, message_type) = (endpoint.role, endpoint.message_type.clone());
         let has_buffers = endpoint.backends.is_some() || naming.is_buffer;
+        let has_filter = endpoint.content_filter;
         let (id, is_new) = self
             .graph
             .topics
@@ -709,6 +718,7 @@ impl Observer {
         if let Some(topic) = self.graph.topics.get_mut(id) {
             topic.last_type = Some(message_type);
             topic.has_buffers |= has_buffers;
+            topic.has_filters |= has_filter;
         }
         if is_new {
             self.graph.topics.shrink(self.settings.endpoints);

@@ -386,6 +386,23 @@ fn fragments_become_one_message_unless_one_is_missing() {
     assert_eq!(measurement.unwrap().bytes, 200_000);
 }
 
+#[test]
+fn a_message_in_fragments_continues_after_the_highest_number_of_any_size() {
+    // Sequence numbers have 7, 14 or 28 bits.
+    for highest in [127, 16_383, (1 << 28) - 1] {
+        let (mut observer, gid) = talking();
+        let [there, _] = connection(1001);
+        let message = push(3, gid, 1, &[7; 100_000]);
+        let parts: Vec<_> = message.chunks(40_000).collect();
+        for (index, part) in parts.iter().enumerate() {
+            let number = [highest - 1, highest, 0][index];
+            let batch = fragment(number, index == 0, index + 1 < parts.len(), part);
+            send(&mut observer, &there, START + 1, &batch);
+        }
+        assert_eq!(messages(&observer), 1, "{highest}");
+    }
+}
+
 // Coverage: Zenoh with compression | - | - | named
 // Coverage: Zenoh, low-latency transport | - | - | named
 #[test]

@@ -93,7 +93,7 @@ impl Discovery {
                     (known.type_hash, known.equivalence_hash),
                     Arc::clone(&known.qos),
                     known.message_type.clone(),
-                    (known.backends.clone(), known.base),
+                    (known.backends.clone(), known.base, known.content_filter),
                 );
                 if *known.qos != announcement.qos {
                     known.qos = Arc::new(announcement.qos.clone());
@@ -102,13 +102,14 @@ impl Discovery {
                     known.backends = announcement.backends.clone().map(Arc::new);
                 }
                 known.base = announcement.base;
+                known.content_filter = announcement.content_filter;
                 known.type_hash = announcement.type_hash;
                 known.equivalence_hash = announcement.equivalence_hash;
                 known.message_type = announcement.type_name.message().as_str().into();
                 let unchanged = before.0 == (known.type_hash, known.equivalence_hash)
                     && before.1 == known.qos
                     && before.2 == known.message_type
-                    && before.3 == (known.backends.clone(), known.base);
+                    && before.3 == (known.backends.clone(), known.base, known.content_filter);
                 if !unchanged {
                     let entity = DiscoveredEntity::endpoint(guid, known);
                     self.changes.push(Change::Changed(guid));
@@ -151,6 +152,7 @@ impl Discovery {
             shared_memory,
             tcp,
             data_sharing: announcement.datasharing,
+            content_filter: announcement.content_filter,
             backends: announcement.backends.map(Arc::new),
             base: announcement.base,
             watched,

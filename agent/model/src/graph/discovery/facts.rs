@@ -172,6 +172,8 @@ pub struct Endpoint {
     pub tcp: Option<bool>,
     /// Whether it supports data sharing with endpoints on its host.
     pub data_sharing: bool,
+    /// Whether it is a reader that announces a content filter.
+    pub content_filter: bool,
     /// Backends of buffers; `None` if it has none.
     pub backends: Option<Arc<Backends>>,
     /// The endpoint of the base topic for which it carries buffers, if it announces one.

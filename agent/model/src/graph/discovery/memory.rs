@@ -106,6 +106,8 @@ struct RememberedEndpoint {
     tcp: Option<bool>,
     #[serde(default)]
     data_sharing: bool,
+    #[serde(default)]
+    content_filter: bool,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     backends: Option<Vec<String>>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -325,6 +327,7 @@ impl RememberedEndpoint {
             shared_memory: endpoint.shared_memory,
             tcp: endpoint.tcp,
             data_sharing: endpoint.data_sharing,
+            content_filter: endpoint.content_filter,
             backends: endpoint
                 .backends
                 .as_deref()
@@ -395,6 +398,7 @@ impl RememberedEndpoint {
             shared_memory: self.shared_memory,
             tcp: self.tcp,
             data_sharing: self.data_sharing,
+            content_filter: self.content_filter,
             backends: self
                 .backends
                 .as_ref()
@@ -516,6 +520,7 @@ mod tests {
             shared_memory: None,
             tcp: None,
             data_sharing: false,
+            content_filter: true,
             backends: None,
             base: None,
             watched: false,
@@ -530,7 +535,8 @@ mod tests {
         let restored = back(&kept);
         assert_eq!(*restored.qos, qos);
         assert_eq!(restored.equivalence_hash, endpoint.equivalence_hash);
-        for key in ["matching", "equivalence_hash"] {
+        assert!(restored.content_filter);
+        for key in ["matching", "equivalence_hash", "content_filter"] {
             kept.as_object_mut().unwrap().remove(key).unwrap();
         }
         let restored = back(&kept);
@@ -538,6 +544,7 @@ mod tests {
             (&*restored.qos, restored.equivalence_hash),
             (&defaults, None)
         );
+        assert!(!restored.content_filter);
     }
 
     #[test]

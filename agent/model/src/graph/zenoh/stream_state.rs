@@ -54,8 +54,8 @@ pub(super) enum Channel {
 #[derive(Debug)]
 pub(super) struct Chain {
     lane: Lane,
-    /// Number of the next FRAGMENT.
-    next: u32,
+    /// Number of the last FRAGMENT.
+    number: u32,
     /// Time of the first FRAGMENT.
     pub(super) began: ModelTime,
     /// Time of the last FRAGMENT.
@@ -108,7 +108,7 @@ impl Chain {
         // The destructuring makes a new list fail to compile until it is listed here.
         let Self {
             lane: _,
-            next: _,
+            number: _,
             began: _,
             last: _,
             bytes,
@@ -240,14 +240,14 @@ impl StreamState {
         if fragment.is_dropped {
             return None;
         }
-        let known = known.filter(|known| known.next == number && !fragment.is_first);
+        let known = known.filter(|known| !fragment.is_first && is_followed(known.number, number));
         let mut chain = match known {
             Some(chain) => chain,
             None => {
                 let is_wanted = begins(fragment.bytes.captured)?;
                 Chain {
                     lane: fragment.lane,
-                    next: number,
+                    number,
                     began: time,
                     last: time,
                     bytes: Vec::new(),
@@ -269,7 +269,7 @@ impl StreamState {
             chain.append(captured.get(..kept).unwrap_or(captured), room);
         }
         chain.last = time;
-        chain.next = Resolution::DEFAULT.next(number);
+        chain.number = number;
         if !fragment.has_more {
             return Some(chain);
         }
@@ -293,6 +293,14 @@ impl StreamState {
     pub(super) fn held(&self) -> usize {
         self.chains.iter().map(Chain::held).sum()
     }
+}
+
+/// Returns whether the number `next` follows `number`. The INIT with the agreed size of numbers may
+/// have been missed, so zero follows the highest number of any size.
+fn is_followed(number: u32, next: u32) -> bool {
+    let mut sizes = (0..4).map(Resolution);
+    let is_highest = |size: Resolution| size.sequence_number_mask() == number;
+    number.wrapping_add(1) == next || next == 0 && sizes.any(is_highest)
 }
 
 /// Returns the key of an expression, through its alias if it has one.

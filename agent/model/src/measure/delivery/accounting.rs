@@ -63,6 +63,8 @@ pub(super) struct Accounting<'a> {
     pub(super) writer: Guid,
     pub(super) receiver: Receiver,
     pub(super) main: Route,
+    /// Whether samples without a known cause of loss may have been rejected by a content filter.
+    pub(super) is_filtered: bool,
     pub(super) at: ModelTime,
     /// End of the time for which a new loss stays pending.
     pub(super) until: Option<ModelTime>,
@@ -88,6 +90,10 @@ impl Accounting<'_> {
             runs.push((first, last, cause));
         });
         for (first, last, cause) in runs {
+            if cause.is_none() && self.is_filtered {
+                self.count(|tally| tally.irrelevant += last - first + 1);
+                continue;
+            }
             if self.withheld.is_none() {
                 let events = &mut self.journal.events;
                 events.add_delivery_loss(self.writer, self.receiver, self.at, (first, last));

@@ -11,7 +11,6 @@ use super::Measured;
 use super::ObservationOutcome;
 use super::Profiler;
 use super::UNKNOWN_AFTER;
-use super::UNKNOWN_WRITER_TIMEOUT;
 use crate::facts::journal::Journal;
 use crate::facts::model_time::ModelTime;
 use crate::facts::observation::Observation;
@@ -33,7 +32,7 @@ pub struct UnknownWriters {
 impl UnknownWriters {
     /// Notes an unknown writer that is metered from now on, or was silent for too long.
     pub(super) fn advance(&mut self, (guid, measured): (Guid, &mut Measured), now: ModelTime) {
-        if measured.last_seen + UNKNOWN_WRITER_TIMEOUT <= now {
+        if measured.last_seen + measured.silence_timeout() <= now {
             self.forgotten.push(guid);
         } else if !measured.metered && measured.first_seen + UNKNOWN_AFTER <= now {
             (measured.metered, measured.opened) = (true, now);
@@ -65,10 +64,10 @@ impl Profiler {
             return ObservationOutcome::Unmeasured;
         }
         self.unknown_writers.insert(guid);
-        self.writers.insert(
-            guid,
-            Measured::new(Writer::new(guid, Traits::default()), None, now),
-        );
+        let mut measured = Measured::new(Writer::new(guid, Traits::default()), None, now);
+        let participants = graph.discovery.participants();
+        measured.has_participant = participants.contains_key(&guid.prefix);
+        self.writers.insert(guid, measured);
         self.observe(observation, journal, graph)
     }
 

@@ -113,6 +113,38 @@ impl<'a> MatchedReaders<'a> {
         known.next() == Some(false) && !known.any(|is_reliable| is_reliable)
     }
 
+    /// Returns whether the writer applies a content filter for each matching reader of this
+    /// participant; `None` means all participants.
+    #[must_use]
+    pub fn are_filtered(self, prefix: Option<GuidPrefix>) -> bool {
+        let Some(topic) = self.topic.filter(|topic| topic.has_filters) else {
+            return false;
+        };
+        let readers: Vec<Guid> = match prefix {
+            Some(prefix) => self.of(prefix).collect(),
+            None if topic.readers.len() > MAX_COMPARED => return false,
+            None => {
+                let readers = topic.readers.iter().copied();
+                readers.filter(|guid| self.matches(*guid)).collect()
+            }
+        };
+        !readers.is_empty() && readers.iter().all(|guid| self.is_filtered(*guid))
+    }
+
+    /// Returns whether the writer applies a content filter of this reader. A writer of Fast DDS
+    /// applies those of Fast DDS; a writer of another vendor sends the reader all samples.
+    fn is_filtered(self, reader: Guid) -> bool {
+        let discovery = &self.graph.discovery;
+        let vendor = |guid: Guid| {
+            let participant = discovery.participants().get(&guid.prefix);
+            participant.map(|participant| participant.proxy.vendor)
+        };
+        let endpoint = discovery.endpoints().get(&reader);
+        endpoint.is_some_and(|endpoint| endpoint.content_filter)
+            && vendor(reader).is_some()
+            && vendor(reader) == vendor(self.writer)
+    }
+
     /// Returns who of the readers gets references to buffers instead of messages. If there are too
     /// many readers, some of them may get messages.
     #[must_use]

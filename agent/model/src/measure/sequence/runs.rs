@@ -3,6 +3,7 @@
 use ros2probe_wire::{SequenceNumber, Timestamp};
 
 use super::MAX_ANNOUNCED_JUMP;
+use super::MAX_IRRELEVANT_AT_START;
 use super::MAX_JUMP;
 use super::MAX_STALE;
 use super::MIN_INCARNATION_GAP;
@@ -33,7 +34,9 @@ impl Sequence {
                 return RunMembership::Unconfirmed { new };
             }
             let mut run = self.confirm();
-            run.numbers.retain(|(known, _)| *known != number);
+            // The caller processes this sample as one of the live run.
+            run.ranges
+                .retain(|range| range.is_whole || range.first != number);
             if let Some(source) = source {
                 self.sourced(number, source);
             }
@@ -97,10 +100,12 @@ impl Sequence {
 
     /// Records the samples of a confirmed run.
     pub fn accept(&mut self, run: &Run, now: ModelTime, settled: &mut impl FnMut(Settled)) {
-        for &(number, is_whole) in &run.numbers {
-            self.exists(number, now, settled);
-            if is_whole {
-                self.received.set(number);
+        for range in &run.ranges {
+            for number in range.first.until(range.last.next()) {
+                self.exists(number, now, settled);
+                if range.is_whole {
+                    self.received.set(number);
+                }
             }
         }
         let (start, end) = run.gap;
@@ -111,17 +116,18 @@ impl Sequence {
     pub(super) fn confirm(&mut self) -> Run {
         let unconfirmed = self.unconfirmed.take();
         let run = unconfirmed.map_or_else(Run::default, |unconfirmed| unconfirmed.into_run());
-        let Some((first, _)) = run.numbers.front() else {
+        let Some(first) = run.ranges.front().map(|range| range.first) else {
             return run;
         };
-        let jump = (*first >= self.next).then(|| *first - self.next);
+        let jump = (first >= self.next).then(|| first - self.next);
         // While the live run has only a few samples, a long jump is a restart rather than a loss.
         let most = match self.followed < REQUIRED_CONFIRMATIONS {
+            _ if self.is_reopened => MAX_IRRELEVANT_AT_START,
             true => MAX_ANNOUNCED_JUMP,
             false => MAX_JUMP,
         };
         if jump.is_none_or(|jump| jump > most) {
-            self.restart(*first);
+            self.restart(first);
         }
         run
     }

@@ -43,6 +43,16 @@ impl Sequence {
         }
     }
 
+    /// Enlarges the window for the history from `first` on, which a new reader may request.
+    pub fn expect_history(&mut self, first: SequenceNumber) {
+        let floor = self.floor();
+        // Numbers below the window that counted before must not count again.
+        let is_new = self.started() && self.first >= floor;
+        if is_new && first > SequenceNumber::ZERO && first < floor {
+            self.widen(self.next.steps_since(first));
+        }
+    }
+
     /// Processes a HEARTBEAT's lastSN, `next - 1`. Returns whether it is confirmed, and the run
     /// that it confirms.
     pub fn claim(

@@ -337,6 +337,22 @@ fn a_jump_beyond_the_window_decides_the_skipped_numbers() {
 }
 
 #[test]
+fn batches_after_a_long_gap_lose_only_the_numbers_of_the_gap() {
+    let mut bench = Bench::default();
+    bench.receive(1..=100);
+    for batch in 0..8 {
+        // All samples of a batch have one time.
+        bench.now += SECOND / 100;
+        for number in 0..100 {
+            bench.receive_at(1101 + batch * 100 + number, None);
+        }
+    }
+    bench.wait(3);
+    assert_eq!(bench.lost, (101..=1100).collect::<Vec<_>>());
+    assert!(bench.duplicates.is_empty());
+}
+
+#[test]
 fn a_sample_that_arrives_after_settling_counts_once() {
     let mut bench = Bench::default();
     bench.receive([1, 3]).wait(3);

@@ -9,6 +9,7 @@ use std::time::Duration;
 use ros2probe_wire::SequenceNumber;
 
 use super::MAX_ANNOUNCED_JUMP;
+use super::MAX_WINDOW;
 use crate::facts::bounded::Bounded;
 use crate::facts::model_time::ModelTime;
 use crate::facts::tables::UnconfirmedNumbers;
@@ -34,26 +35,69 @@ pub(super) struct UnconfirmedRun {
 /// Samples that were counted before their numbers were confirmed.
 #[derive(Clone, Debug, Default)]
 pub struct Run {
-    /// Numbers, and whether each sample is whole; sorted once confirmed.
-    pub numbers: Bounded<UnconfirmedNumbers, VecDeque<(SequenceNumber, bool)>>,
+    /// Ranges without common numbers; sorted once confirmed.
+    pub ranges: Bounded<UnconfirmedNumbers, VecDeque<NumberRange>>,
     /// Numbers that a GAP skipped before the run.
     pub(super) gap: (SequenceNumber, SequenceNumber),
+}
+
+/// Consecutive numbers of a run.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct NumberRange {
+    /// The lowest number.
+    pub first: SequenceNumber,
+    /// The highest number. It equals `first` unless the samples are whole.
+    pub last: SequenceNumber,
+    /// Whether the samples are whole.
+    pub is_whole: bool,
+}
+
+impl NumberRange {
+    /// Returns the number of samples.
+    #[must_use]
+    pub const fn count(&self) -> u64 {
+        self.last.steps_since(self.first) + 1
+    }
+
+    fn contains(&self, number: SequenceNumber) -> bool {
+        self.first <= number && number <= self.last
+    }
+
+    /// Adds a number directly after or before the range. Returns whether it was added.
+    fn extend(&mut self, number: SequenceNumber) -> bool {
+        if !self.is_whole || self.count() >= MAX_WINDOW {
+            return false;
+        }
+        if self.last.precedes(number) {
+            self.last = number;
+            return true;
+        }
+        if number.precedes(self.first) {
+            self.first = number;
+            return true;
+        }
+        false
+    }
 }
 
 impl UnconfirmedRun {
     /// Records the number of a sample. Returns whether it begins a run, and whether it is new.
     pub(super) fn note(&mut self, number: SequenceNumber, now: ModelTime) -> (bool, bool) {
-        let numbers = &self.run.numbers;
-        if numbers.iter().any(|(known, _)| *known == number) {
+        let ranges = &mut self.run.ranges;
+        if ranges.iter().any(|range| range.contains(number)) {
             return (false, false);
         }
-        let last = numbers.back().map(|(last, _)| *last);
+        let last = ranges.back().map(|range| range.last);
         let opens = last.is_none_or(|last| last.distance(number) > MAX_ANNOUNCED_JUMP);
         if opens {
-            self.run.numbers.clear();
+            ranges.clear();
             self.evidence = 0;
         }
-        self.run.numbers.push_back((number, false));
+        ranges.push_back(NumberRange {
+            first: number,
+            last: number,
+            is_whole: false,
+        });
         if self.evidence == 0 {
             self.since = now;
         }
@@ -66,21 +110,30 @@ impl UnconfirmedRun {
 
     /// Marks a sample as whole. Returns whether it was recorded and not yet whole.
     pub(super) fn complete(&mut self, number: SequenceNumber) -> bool {
-        let mut numbers = self.run.numbers.iter_mut();
-        let Some((_, is_whole)) = numbers.find(|(known, _)| *known == number) else {
+        let ranges = &mut self.run.ranges;
+        let is_noted = |range: &NumberRange| !range.is_whole && range.contains(number);
+        let Some(index) = ranges.iter().rposition(is_noted) else {
             return false;
         };
-        !std::mem::replace(is_whole, true)
+        if ranges.iter_mut().rev().any(|range| range.extend(number)) {
+            ranges.remove(index);
+        } else if let Some(range) = ranges.get_mut(index) {
+            range.is_whole = true;
+        }
+        true
     }
 
     /// Returns whether this number continues a run below `live`.
     pub(super) fn is_continued(&self, number: SequenceNumber, live: SequenceNumber) -> bool {
-        let last = self.run.numbers.back().filter(|_| self.evidence > 0);
-        last.is_some_and(|(last, _)| *last < live && last.distance(number) <= MAX_ANNOUNCED_JUMP)
+        let range = self.run.ranges.back().filter(|_| self.evidence > 0);
+        range.is_some_and(|range| {
+            range.last < live && range.last.distance(number) <= MAX_ANNOUNCED_JUMP
+        })
     }
 
     pub(super) fn is_whole(&self, number: SequenceNumber) -> bool {
-        self.run.numbers.contains(&(number, true))
+        let mut ranges = self.run.ranges.iter();
+        ranges.any(|range| range.is_whole && range.contains(number))
     }
 
     pub(super) const fn is_confirmed(&self) -> bool {
@@ -129,12 +182,9 @@ impl UnconfirmedRun {
     /// Returns the samples that arrived, in ascending order.
     pub(super) fn into_run(self) -> Run {
         let mut run = self.run;
-        run.numbers.make_contiguous().sort_unstable();
-        if run
-            .numbers
-            .front()
-            .is_none_or(|(first, _)| run.gap.1 > *first)
-        {
+        run.ranges.make_contiguous().sort_unstable();
+        let first = run.ranges.front().map(|range| range.first);
+        if first.is_none_or(|first| run.gap.1 > first) {
             // The GAP contradicts the samples that arrived.
             run.gap = Default::default();
         }
@@ -143,8 +193,8 @@ impl UnconfirmedRun {
 
     /// Returns the highest number of the run, plus one.
     fn end(&self) -> SequenceNumber {
-        let numbers = self.run.numbers.iter();
-        let ends = numbers.map(|(number, _)| number.next());
+        let ranges = self.run.ranges.iter();
+        let ends = ranges.map(|range| range.last.next());
         ends.max().unwrap_or_default()
     }
 }
@@ -162,7 +212,7 @@ mod tests {
                 (number == 1, true)
             );
         }
-        assert!(unconfirmed.run.numbers.is_full());
+        assert!(unconfirmed.run.ranges.is_full());
         // A number that was dropped is new again.
         assert_eq!(
             unconfirmed.note(SequenceNumber(1), ModelTime::from_nanoseconds(1)),
@@ -173,5 +223,25 @@ mod tests {
             (false, false)
         );
         assert_eq!(unconfirmed.evidence, 1);
+    }
+
+    #[test]
+    fn whole_samples_of_a_run_extend_one_range_whatever_their_order() {
+        let mut unconfirmed = UnconfirmedRun::default();
+        let at = ModelTime::from_nanoseconds(1);
+        for number in [12, 11, 10, 13, 14].map(SequenceNumber) {
+            unconfirmed.note(number, at);
+            assert!(unconfirmed.complete(number) && !unconfirmed.complete(number));
+            assert!(unconfirmed.is_whole(number));
+        }
+        let run = unconfirmed.into_run();
+        assert_eq!(
+            run.ranges.iter().copied().collect::<Vec<_>>(),
+            [NumberRange {
+                first: SequenceNumber(10),
+                last: SequenceNumber(14),
+                is_whole: true,
+            }]
+        );
     }
 }

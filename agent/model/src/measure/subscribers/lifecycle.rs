@@ -8,6 +8,7 @@ use ros2probe_wire::{GuidPrefix, SequenceNumber};
 
 use super::Subscribers;
 use super::WriterContext;
+use super::addressee;
 use super::delivery_context;
 use super::is_best_effort;
 use super::is_reader;
@@ -228,7 +229,11 @@ impl Subscribers {
             if is_left {
                 delivery.close(context.budget);
             }
-            delivery.learn(is_best_effort(delivery.receiver(), readers));
+            let receiver = delivery.receiver();
+            let known = self.routes.find(&delivery.main_route());
+            let owner = known.and_then(|at| self.routes.get(at)?.owner);
+            let is_filtered = readers.are_filtered(addressee(receiver, owner));
+            delivery.learn(is_best_effort(receiver, readers), is_filtered);
             let appeared = match delivery.receiver() {
                 Receiver::Participant(prefix) => readers.since(prefix),
                 Receiver::Route(_) => topic.map(|topic| topic.reader_appeared),
@@ -237,6 +242,7 @@ impl Subscribers {
                 delivery.open(at);
             }
         }
+        self.note_filters();
         self.acknowledgements
             .retain(|guid| topic.is_some_and(|topic| is_reader(topic, guid)));
     }
@@ -406,6 +412,7 @@ impl Subscribers {
                 .iter_mut()
                 .for_each(|known| known.delivery = None);
             self.count_open();
+            self.note_filters();
         }
     }
 }

@@ -1,15 +1,44 @@
 //! Latencies of a writer's samples since INFO_TS and since their header's stamp. Both come from the
 //! clock of the writer's host.
 
+use std::time::Duration;
+
 use ros2probe_wire::{RtpsTime, SequenceNumber, Timestamp};
 
+use super::HISTORY_TIME;
 use super::MIN_HISTORY_AGE;
+use super::MeasurementContext;
 use super::Writer;
 use super::seconds;
 use crate::facts::header::{MAX_PLAUSIBLE_OFFSET, stamp_time};
 use crate::facts::model_time::ModelTime;
+use crate::facts::observation::Observation;
 
 impl Writer {
+    /// Returns whether the observation is a sample from before `opened`, when a reader appeared that
+    /// may have requested it. The clock of the writer's host may be behind. Samples that arrive at
+    /// the pace of their timestamps are therefore live after a while.
+    pub(super) fn is_history(
+        &self,
+        opened: ModelTime,
+        observation: &Observation,
+        context: &MeasurementContext<'_>,
+    ) -> bool {
+        let sample = observation.sample();
+        let Some(source) = sample.and_then(|sample| sample.source_timestamp.timestamp()) else {
+            return false;
+        };
+        if on_this_clock(source, self.clock_ahead) >= context.wall_clock.wall_time(opened) {
+            return false;
+        }
+        let Some(last) = self.last_message else {
+            return true;
+        };
+        let before = self.reception.sequence().newest_source();
+        let sent_apart = Duration::from_nanos(source.0.saturating_sub(before.0));
+        opened + HISTORY_TIME > context.now || sent_apart > 2 * (context.now - last)
+    }
+
     pub(super) fn delays(
         &mut self,
         number: SequenceNumber,
@@ -18,8 +47,7 @@ impl Writer {
         (now, wall_clock): (ModelTime, Timestamp),
     ) {
         let ahead = self.clock_ahead;
-        let here =
-            |stamp: Timestamp| Timestamp(stamp.0.saturating_add_signed(ahead.saturating_neg()));
+        let here = |stamp| on_this_clock(stamp, ahead);
         let source = source.timestamp().map(here);
         if self.traits.keeps_history {
             let old = source.is_none_or(|source| source + MIN_HISTORY_AGE < wall_clock);
@@ -54,4 +82,9 @@ impl Writer {
         }
         self.negative_latency += u64::from(negative);
     }
+}
+
+/// Converts a timestamp of a clock that is ahead by this many nanoseconds.
+const fn on_this_clock(stamp: Timestamp, ahead: i64) -> Timestamp {
+    Timestamp(stamp.0.saturating_add_signed(ahead.saturating_neg()))
 }

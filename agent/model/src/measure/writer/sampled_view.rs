@@ -46,7 +46,7 @@ impl Writer {
     pub(super) fn sampled_observation(
         &mut self,
         observation: &Observation,
-        is_sampled: bool,
+        (is_sampled, is_history): (bool, bool),
         context: &mut MeasurementContext<'_>,
     ) -> Option<Counted> {
         let now = context.now;
@@ -72,6 +72,7 @@ impl Writer {
                 return self.sampled_sample(
                     sample,
                     &update,
+                    is_history,
                     (now, context.wall_clock.wall_time(now)),
                 );
             }
@@ -161,6 +162,7 @@ impl Writer {
     pub(super) fn catch_up(
         &mut self,
         sample: &Sample,
+        is_history: bool,
         context: &mut MeasurementContext<'_>,
     ) -> Option<Counted> {
         let now = context.now;
@@ -177,13 +179,15 @@ impl Writer {
         };
         let number = sample.sequence_number;
         let update = self.sampled.as_mut()?.add_late(number, seen);
-        self.sampled_sample(sample, &update, (now, context.wall_clock.wall_time(now)))
+        let times = (now, context.wall_clock.wall_time(now));
+        self.sampled_sample(sample, &update, is_history, times)
     }
 
     fn sampled_sample(
         &mut self,
         sample: &Sample,
         update: &SampledUpdate,
+        is_history: bool,
         (now, wall_clock): (ModelTime, Timestamp),
     ) -> Option<Counted> {
         let (number, is_message) = (sample.sequence_number, sample.is_message());
@@ -194,7 +198,7 @@ impl Writer {
             self.interarrival.observe(seconds(interval));
         }
         let source = sample.source_timestamp;
-        if update.arrived && is_message {
+        if update.arrived && is_message && !is_history {
             self.delays(number, true, (source, stamp), (now, wall_clock));
         }
         if update.finished && is_message {

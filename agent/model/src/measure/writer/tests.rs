@@ -313,6 +313,66 @@ fn history_for_a_late_joiner_does_not_count_as_latency() {
 }
 
 #[test]
+fn history_for_a_new_reader_has_neither_latency_nor_rate() {
+    for depth in [10, 100] {
+        let mut bench = Bench::new(Traits {
+            keeps_history: true,
+            ..RELIABLE
+        });
+        bench.opened = ModelTime::from_nanoseconds(bench.now);
+        bench.now += 20 * MILLISECOND;
+        // The youngest sample is a tenth of a second older than the reader.
+        for number in 1..=depth {
+            let sent = START - (depth + 1 - number) * SECOND / 10;
+            bench.now += MILLISECOND / 2;
+            bench.put(Record {
+                source_timestamp: stamp(sent),
+                ..data(number)
+            });
+        }
+        bench.wait(2000);
+        let facts = bench.facts();
+        assert_eq!((facts.messages, facts.source_latency.count()), (depth, 0));
+        assert!(facts.rate_hz.abs() < 1e-9, "{}", facts.rate_hz);
+        for number in depth + 1..=depth + 100 {
+            bench.now += SECOND / 10;
+            bench.put(Record {
+                source_timestamp: stamp(bench.now - MILLISECOND),
+                ..data(number)
+            });
+        }
+        let facts = bench.facts();
+        assert_eq!(facts.source_latency.count(), 100);
+        let (_, longest) = facts.source_latency.range().unwrap();
+        assert!(longest < 0.002, "{longest}");
+    }
+}
+
+#[test]
+fn messages_of_a_host_whose_clock_is_behind_are_not_history() {
+    let mut bench = Bench::new(Traits {
+        keeps_history: true,
+        ..RELIABLE
+    });
+    bench.opened = ModelTime::from_nanoseconds(bench.now);
+    for number in 1..=150 {
+        bench.now += SECOND / 10;
+        bench.put(Record {
+            source_timestamp: stamp(bench.now - 3600 * SECOND),
+            ..data(number)
+        });
+    }
+    let rate = bench.facts().rate_hz;
+    assert!((rate - 10.0).abs() < 0.2, "{rate}");
+}
+
+/// Returns this time as INFO_TS has it.
+fn stamp(nanoseconds: u64) -> u64 {
+    let (seconds, rest) = (nanoseconds / SECOND, nanoseconds % SECOND);
+    seconds << 32 | (rest << 32) / SECOND
+}
+
+#[test]
 fn intervals_between_messages_are_measured_exactly() {
     let mut bench = Bench::new(Traits::default());
     for number in 1..=201 {
@@ -336,6 +396,24 @@ fn samples_sent_to_other_hosts_before_a_local_reader_existed_are_not_lost() {
     bench.wait(5000);
     let facts = bench.facts();
     assert_eq!((facts.messages, facts.lost, facts.irrelevant), (7, 0, 497));
+}
+
+#[test]
+fn a_hundred_thousand_samples_without_a_reader_are_not_lost() {
+    let mut bench = Bench::new(Traits::default());
+    for number in 1..=100 {
+        bench.now += MILLISECOND;
+        bench.data(number);
+    }
+    bench.wait(100_000);
+    bench.opened = ModelTime::from_nanoseconds(bench.now);
+    for number in 100_101..=100_200 {
+        bench.now += MILLISECOND;
+        bench.data(number);
+    }
+    bench.wait(5000);
+    let facts = bench.facts();
+    assert_eq!((facts.messages, facts.lost, facts.duplicates), (200, 0, 0));
 }
 
 #[test]

@@ -15,7 +15,7 @@ use crate::facts::observation::{Content, DatagramFate, Head, Observation, Path, 
 use crate::facts::route::Direction;
 use crate::graph::discovery::{Origin, Priority};
 use crate::graph::zenoh::{
-    GraphChange, Holder, ReportFact, StreamId, StreamReport, ZenohSample, unknown_guid,
+    GraphChange, Holder, ReportFact, StreamEvent, StreamId, StreamReport, ZenohSample, unknown_guid,
 };
 use crate::measure::topic::Accelerated;
 
@@ -72,6 +72,9 @@ impl Observer {
                 }
                 false => zenoh.graph.announce_again(session, at),
             }
+        }
+        if matches!(report.event, StreamEvent::End) {
+            self.measure.links.end(report.stream);
         }
         self.zenoh = zenoh;
         self.change_zenoh_graph(at);

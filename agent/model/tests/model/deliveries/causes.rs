@@ -5,6 +5,7 @@ use ros2probe_model::observe::input::Input;
 use ros2probe_testing::model::host::{BOB, CapturePoint, Host};
 use ros2probe_wire::Record;
 use ros2probe_wire::record::{flag, kind};
+use ros2probe_wire::time::SECOND;
 
 #[test]
 fn each_cause_has_its_own_count_and_all_counts_add_up() {
@@ -202,6 +203,26 @@ fn a_sample_that_left_this_host_is_lost_if_it_never_arrives_at_an_open_socket() 
             (20, 17)
         );
         assert_eq!(breakdown.transit.range(), Some((0.001, 0.001)));
+    }
+}
+
+#[test]
+fn send_delays_continue_after_the_wall_clock_was_set_back() {
+    const HOUR: i64 = 3600 * SECOND.cast_signed();
+    for step in [-HOUR, HOUR] {
+        let mut host = Host::new();
+        let bob = host.reader(BOB, 7411);
+        for number in 1..=20 {
+            if number == 11 {
+                // The writer uses the same clock.
+                host.now = host.now.saturating_add_signed(step);
+                host.observer.input(Input::ClockSet(step));
+            }
+            host.data(bob.leaving(), number);
+            host.wait(100);
+        }
+        let breakdown = host.topic().breakdown.unwrap();
+        assert_eq!(breakdown.send_delay.count(), 20, "{step}");
     }
 }
 

@@ -1,7 +1,9 @@
 //! HEARTBEAT and ACKNACK: the samples that a writer still has, and those that a reader waits for.
 
 use ros2probe_model::facts::loss::LossCause;
-use ros2probe_testing::model::host::{BOB, CAROL, Host};
+use ros2probe_testing::model::forge::{self, Message, SEDP_READERS};
+use ros2probe_testing::model::host::{BOB, CAROL, Host, READER, STRING};
+use ros2probe_wire::Guid;
 
 #[test]
 fn a_directed_heartbeat_announces_the_last_samples_only_to_its_reader() {
@@ -142,6 +144,81 @@ fn an_acknowledged_sample_that_was_not_captured_is_not_lost() {
         (host.measurement().lost, host.measurement().irrelevant),
         (0, 10)
     );
+}
+
+#[test]
+fn samples_that_a_content_filter_rejects_are_lost_only_if_the_cause_is_known() {
+    for is_reliable in [false, true] {
+        let mut host = Host::new();
+        let bob = host.reader(BOB, 7411);
+        let reliability = [&(1 + u32::from(is_reliable)).to_le_bytes()[..], &[0; 8]].concat();
+        let filtered: [(u16, &[u8]); 2] = [(0x1a, &reliability), (0x35, &[0; 4])];
+        let guid = Guid::new(BOB, READER);
+        let payload = forge::endpoint_with(guid, "rt/chatter", STRING, &filtered);
+        host.announce(Message::from(BOB).data(SEDP_READERS, 2, &payload));
+        for number in (20..=800).step_by(20) {
+            host.data(bob, number);
+            if is_reliable {
+                host.heartbeat(bob, number - 9, number);
+                host.acknack(bob, number + 1);
+            }
+            host.wait(100);
+        }
+        host.socket_full(bob, 810);
+        host.data(bob, 820);
+        (0..15).for_each(|_| host.wait(1000));
+        let facts = host.deliveries()[0].delivered;
+        let lost = (facts.lost(), facts.lost_in_socket_buffer);
+        assert_eq!((facts.messages, lost), (41, (1, 1)), "{is_reliable}");
+        assert_eq!(facts.irrelevant, 39 * 19 + 18, "{is_reliable}");
+        assert_eq!(host.measurement().lost, 0, "{is_reliable}");
+    }
+}
+
+#[test]
+fn a_history_of_thousands_of_samples_is_delivered_whole() {
+    for is_first_live in [false, true] {
+        let mut host = Host::new();
+        let bob = host.reader(BOB, 7411);
+        if is_first_live {
+            host.data(bob, 3000);
+        }
+        host.heartbeat(bob.directed(BOB), 1, 3000);
+        for number in (1..3000).chain(3000 + u64::from(is_first_live)..=3100) {
+            host.data(bob, number);
+            if number.is_multiple_of(100) {
+                host.wait(10);
+            }
+        }
+        (0..15).for_each(|_| host.wait(1000));
+        let facts = host.deliveries()[0].delivered;
+        let history = 3000 - u64::from(is_first_live);
+        assert_eq!((facts.messages, facts.history), (3100, history));
+        assert_eq!((facts.duplicates, facts.lost()), (0, 0));
+    }
+}
+
+#[test]
+fn a_hundred_thousand_samples_written_without_a_reader_are_lost_at_neither_end() {
+    for is_sender in [false, true] {
+        let mut host = Host::new();
+        let bob = host.reader(BOB, 7411);
+        let seen = if is_sender { bob.leaving() } else { bob };
+        for number in 1..=100 {
+            host.data(seen, number);
+            host.wait(10);
+        }
+        host.unsubscribe(BOB, 2);
+        (0..100).for_each(|_| host.wait(1000));
+        host.subscribe(BOB, 3);
+        for number in 100_101..=100_200 {
+            host.data(seen, number);
+            host.wait(10);
+        }
+        (0..15).for_each(|_| host.wait(1000));
+        let facts = host.measurement();
+        assert_eq!((facts.messages, facts.lost), (200, 0), "{is_sender}");
+    }
 }
 
 #[test]

@@ -161,3 +161,18 @@ fn a_sample_that_arrives_after_its_writer_left_adds_no_unknown_writer() {
     world.wait(10_000);
     assert!(world.snapshot().unknown_writers.is_empty());
 }
+
+#[test]
+fn an_unknown_writer_with_a_message_every_forty_seconds_stays_until_it_is_silent() {
+    let mut world = World::new(&["/chatter"]);
+    world.spdp(ALICE, 1000);
+    for number in 1..=5 {
+        world.sample(alice(WRITER), number);
+        (0..40).for_each(|_| world.wait(1000));
+    }
+    let unknown = world.snapshot().unknown_writers;
+    assert_eq!(unknown.len(), 1);
+    assert_eq!(unknown[0].measurement.messages, 5);
+    (0..130).for_each(|_| world.wait(1000));
+    assert!(world.snapshot().unknown_writers.is_empty());
+}

@@ -13,7 +13,8 @@ use std::time::{Duration, Instant, SystemTime};
 use ros2probe_history::{
     Block, Kind, ProcessName, ProcessRow, Series, Store, Tier, TopicName, TopicRow,
 };
-use ros2probe_model::measure::history::{Past, Row};
+use ros2probe_model::facts::model_time::ModelTime;
+use ros2probe_model::measure::history::{Past, Row, Second};
 use serde::Serialize;
 
 use super::super::body_stream::write_line;
@@ -52,6 +53,8 @@ struct Minute {
     context: Context,
     /// Unix time up to which rows are written.
     written: u32,
+    /// The same as model time, which steps of the clock do not change.
+    written_end: ModelTime,
     /// Usage of each process at the last reading.
     usage: HashMap<u32, LastUsage>,
     processes: BTreeMap<ProcessName, Vec<ProcessRow>>,
@@ -106,6 +109,7 @@ impl Minute {
         Self {
             context,
             written: 0,
+            written_end: ModelTime::ZERO,
             usage: HashMap::new(),
             processes: BTreeMap::new(),
             events: EventLines::default(),
@@ -219,10 +223,16 @@ impl Minute {
             return;
         };
         let past = self.context.latest.past();
-        let last = past.seconds().last().map(|last| seconds(last.at));
-        let now = last.unwrap_or_else(unix_time);
-        let begin = self.begin(&past, now);
-        let mut blocks = vec![Block::of_topics(begin, now, &topics(&past, begin))];
+        let last = past.seconds().last();
+        let now = last.map_or_else(unix_time, |last| seconds(last.at));
+        // A source that went back has begun again.
+        let is_later = last.is_some_and(|last| last.end >= self.written_end);
+        let fresh = past.since(match is_later {
+            true => self.written_end,
+            false => ModelTime::ZERO,
+        });
+        let begin = self.begin(fresh, now);
+        let mut blocks = vec![Block::of_topics(begin, now, &topics(&past, fresh))];
         let processes = std::mem::take(&mut self.processes).into_iter();
         let processes: Vec<_> = processes.map(|(of, rows)| Series { of, rows }).collect();
         if !processes.is_empty() {
@@ -240,7 +250,9 @@ impl Minute {
             blocks.push(text(Kind::Events, events));
         }
         // Without a published second, those until now are written next time.
-        self.written = last.unwrap_or(self.written);
+        if let Some(last) = last {
+            (self.written, self.written_end) = (now, last.end);
+        }
         let written = append(store, &blocks, now);
         history.count(&written);
         let failed_before = std::mem::replace(&mut self.is_failing, written.is_err());
@@ -253,14 +265,14 @@ impl Minute {
         }
     }
 
-    /// Returns the time after which rows are not written yet.
-    fn begin(&self, past: &Past, now: u32) -> u32 {
-        let first = past.seconds().first();
-        let first = first.map_or(now, |first| seconds(first.at));
-        // After a step back of the clock, the ring begins again.
+    /// Returns the time after which rows are not written yet: the `fresh` ones.
+    fn begin(&self, fresh: &[Arc<Second>], now: u32) -> u32 {
+        let first = fresh.first();
+        let first = first.map_or(now, |first| seconds(first.at).saturating_sub(1));
+        // After a step back of the clock, rows of later times are written already.
         let last = Some(self.written).filter(|written| *written <= now);
-        let begin = last.unwrap_or(0).max(first.saturating_sub(1));
-        let all = past.seconds().iter().map(|second| seconds(second.at));
+        let begin = last.unwrap_or(0).max(first);
+        let all = fresh.iter().map(|second| seconds(second.at));
         after_gap(begin, all.filter(|at| *at > begin))
     }
 }
@@ -296,14 +308,10 @@ fn after_gap(begin: u32, new: impl Iterator<Item = u32>) -> u32 {
     begin
 }
 
-/// Returns the rows of each topic that end after `begin`.
-fn topics(past: &Past, begin: u32) -> Vec<Series<TopicName, TopicRow>> {
+/// Returns the rows of each topic in these seconds.
+fn topics(past: &Past, fresh: &[Arc<Second>]) -> Vec<Series<TopicName, TopicRow>> {
     let mut rows: HashMap<u32, Vec<TopicRow>> = HashMap::new();
-    let new = past
-        .seconds()
-        .iter()
-        .filter(|second| seconds(second.at) > begin);
-    for second in new {
+    for second in fresh {
         for row in second.rows() {
             let rows = rows.entry(row.topic()).or_default();
             rows.push(topic_row(seconds(second.at), row));
