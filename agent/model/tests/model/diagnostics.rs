@@ -13,6 +13,8 @@ use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 
 const PREFIX: GuidPrefix = GuidPrefix([3; 12]);
 const WRITER: Guid = Guid::new(PREFIX, EntityId([0, 0, 1, 3]));
+/// The writer of another node on the same topic.
+const OTHER: Guid = Guid::new(GuidPrefix([4; 12]), EntityId([0, 0, 1, 3]));
 const LIDAR: &str = "lidar: connection";
 
 /// A robot that publishes diagnostics. No watch covers them.
@@ -57,6 +59,36 @@ impl Robot {
             self.say(level, &format!("message {second}"));
             self.domain.wait(1000);
         }
+    }
+
+    /// Sends this level of each part once a second: of the lidar, and of another node's arm.
+    fn publish_both_for(&mut self, lidar: u8, arm: u8, seconds: u64) {
+        for _ in 0..seconds {
+            self.say(lidar, "text");
+            let arm = Status {
+                level: arm,
+                name: "arm",
+                message: "text",
+                values: &[],
+            };
+            let payload = diagnostics(&[arm]);
+            let message = Message::from(OTHER.prefix).data(OTHER.entity, self.number, &payload);
+            self.domain.put(message);
+            self.domain.wait(1000);
+        }
+    }
+
+    /// Returns the parts whose findings appeared or ended since the last call.
+    fn reported(&mut self) -> Vec<(String, bool)> {
+        let events = self.domain.observer.drain().events.events;
+        let reported = events.into_iter().filter_map(|event| match event.kind {
+            EventKind::Diagnosis {
+                finding: Diagnosis::DiagnosticError { name, .. },
+                resolved,
+            } => Some((name.to_string(), resolved)),
+            _ => None,
+        });
+        reported.collect()
     }
 
     fn only(&self) -> DiagnosticStatus {
@@ -148,6 +180,23 @@ fn an_error_of_five_seconds_is_a_finding_until_it_ends() {
     assert_eq!(robot.findings(), reported);
     robot.publish_for(0, 2);
     assert_eq!(robot.findings(), []);
+}
+
+#[test]
+fn the_error_of_one_node_that_ends_leaves_that_of_another_node() {
+    let mut robot = Robot::new();
+    robot.domain.participant(OTHER.prefix, 100_000);
+    let payload = forge::endpoint(OTHER, "rt/diagnostics", DDS_TYPE, true);
+    let message = Message::from(OTHER.prefix).data(SEDP_WRITERS, 1, &payload);
+    robot.domain.put(message);
+    let node = [("/", "gripper", OTHER)];
+    robot.domain.nodes(OTHER.prefix, 1, &node);
+    robot.publish_both_for(0, 2, 7);
+    assert_eq!(robot.reported(), [("arm".to_owned(), false)]);
+    robot.publish_both_for(2, 2, 7);
+    assert_eq!(robot.reported(), [(LIDAR.to_owned(), false)]);
+    robot.publish_both_for(0, 2, 2);
+    assert_eq!(robot.reported(), [(LIDAR.to_owned(), true)]);
 }
 
 #[test]
