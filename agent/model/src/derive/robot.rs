@@ -29,6 +29,7 @@ use crate::derive::services::service::CallId;
 use crate::facts::bounded::{Bounded, Counted, TableFacts};
 use crate::facts::diagnosis::Diagnosis;
 use crate::facts::event::Events;
+use crate::facts::header::begins_with_header;
 use crate::facts::model_time::ModelTime;
 use crate::facts::names::{NodeName, TopicName, TypeName};
 use crate::facts::observation::Sample;
@@ -108,6 +109,15 @@ pub enum Standard {
     Fields,
 }
 
+/// What is read of a writer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Reading {
+    /// Its messages, which are of this type.
+    Messages(Standard),
+    /// The frame in the header of one message.
+    Frame,
+}
+
 /// What the configuration expects of a robot, and wants to know about it.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct RobotExpectations {
@@ -123,6 +133,8 @@ pub struct RobotExpectations {
 #[derive(Debug)]
 pub struct Robot {
     writers: Bounded<Counted<RobotWriters>, HashMap<Guid, RobotWriter>>,
+    /// Whether a full table refused a writer since [`Robot::retry`].
+    has_refused: bool,
     assembly: Assembly,
     allowances: Allowances,
     logs: Logs,
@@ -285,6 +297,7 @@ impl Default for Robot {
     fn default() -> Self {
         Self {
             writers: Bounded::default(),
+            has_refused: false,
             assembly: Assembly::new(ASSEMBLY_BYTES),
             allowances: Allowances {
                 transforms: CommonAllowance::new(COMMON_BROADCASTER_ALLOWANCE, RESUME_BYTES),
@@ -327,25 +340,41 @@ impl Robot {
         }
     }
 
-    /// Returns how messages of this type on this topic are read; `None` if they are not.
+    /// Returns what is read of writers of this type on this topic; `None` if nothing is.
     #[must_use]
-    pub fn standard(&self, topic: &TopicName, message_type: &TypeName) -> Option<Standard> {
+    pub fn reading(
+        &self,
+        topic: &TopicName,
+        message_type: &TypeName,
+        parts: Parts,
+    ) -> Option<Reading> {
         let is_wanted = || self.fields.cover(topic, message_type);
-        Standard::of(message_type).or_else(|| is_wanted().then_some(Standard::Fields))
+        let standard = Standard::of(message_type);
+        match standard.or_else(|| is_wanted().then_some(Standard::Fields)) {
+            Some(standard) => parts
+                .has(standard.part())
+                .then_some(Reading::Messages(standard)),
+            None => {
+                let has_frame = parts.has(Part::Transforms) && begins_with_header(message_type);
+                has_frame.then_some(Reading::Frame)
+            }
+        }
     }
 
-    /// Begins to wait for one message of this writer, for the frame in its header.
-    pub fn follow_frame(&mut self, writer: Guid, domain_id: DomainId, topic: &TopicName) {
-        self.frames.follow(writer, domain_id, topic);
-    }
-
-    /// Begins to read this writer, unless the table of writers is full.
+    /// Begins to read this writer, unless the table of such writers is full.
     pub fn follow(
         &mut self,
         writer: Guid,
         (domain_id, topic): (DomainId, &TopicName),
-        standard: Standard,
+        reading: Reading,
     ) {
+        let standard = match reading {
+            Reading::Messages(standard) => standard,
+            Reading::Frame => {
+                self.has_refused |= !self.frames.follow(writer, domain_id, topic);
+                return;
+            }
+        };
         let new = || RobotWriter {
             domain_id,
             topic: topic.clone(),
@@ -356,15 +385,40 @@ impl Robot {
             }),
             read: ReadNumbers::default(),
         };
-        self.writers.get_or_insert_with(writer, new);
+        self.has_refused |= self.writers.get_or_insert_with(writer, new).is_none();
         if standard == Standard::Transforms {
+            // A static broadcaster that is refused counts as unread.
             self.transforms.follow(writer, domain_id, topic);
         }
+    }
+
+    /// Returns whether a table refused a writer, and one has room again. The caller should then
+    /// call [`Self::follow`] for each writer that [`Self::has_place_for`] admits.
+    #[must_use]
+    pub fn may_retry(&self) -> bool {
+        self.has_refused && !(self.writers.is_full() && self.frames.is_full())
+    }
+
+    /// Begins a retry. Writers that are refused from now on cause another one.
+    pub const fn retry(&mut self) {
+        self.has_refused = false;
+    }
+
+    /// Returns whether the writer is not followed and its table has room. A table without room
+    /// counts as one that refused the writer.
+    pub fn has_place_for(&mut self, writer: Guid, reading: Reading) -> bool {
+        let (is_known, is_full) = match reading {
+            Reading::Messages(_) => (self.writers.contains_key(&writer), self.writers.is_full()),
+            Reading::Frame => (self.frames.knows(writer), self.frames.is_full()),
+        };
+        self.has_refused |= !is_known && is_full;
+        !is_known && !is_full
     }
 
     /// Stops reading this writer.
     pub fn forget(&mut self, writer: Guid) {
         self.frames.forget(writer);
+        self.transforms.forget_unread(writer);
         if let Some(known) = self.writers.remove(&writer) {
             self.allowances.of(known.standard).forget(&known.allowance);
             self.assembly.release(writer);

@@ -8,6 +8,7 @@ use ros2probe_model::report::snapshot::DiagnosticStatus;
 use ros2probe_testing::model::domain::VirtualDomain;
 use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS};
 use ros2probe_testing::robot_diagnostics::{DDS_TYPE, Status, diagnostics};
+use ros2probe_testing::{robot_log, robot_transforms};
 use ros2probe_wire::diagnostics::DiagnosticLevel::{self, Error, Ok, Stale, Warn};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 
@@ -25,7 +26,10 @@ struct Robot {
 
 impl Robot {
     fn with(settings: Settings, topic: &str) -> Self {
-        let mut domain = VirtualDomain::new(&[], settings);
+        Self::within(VirtualDomain::new(&[], settings), topic)
+    }
+
+    fn within(mut domain: VirtualDomain, topic: &str) -> Self {
         domain.participant(PREFIX, 100_000);
         let payload = forge::endpoint(WRITER, topic, DDS_TYPE, true);
         domain.put(Message::from(PREFIX).data(SEDP_WRITERS, 1, &payload));
@@ -308,4 +312,38 @@ fn a_diagnostic_part_beyond_the_cap_displaces_the_part_with_the_longest_silence(
     assert_eq!(statuses.len(), 1024);
     assert!(statuses.iter().all(|status| &*status.name != "part 0"));
     assert!(statuses.iter().any(|status| &*status.name == "part 1099"));
+}
+
+#[test]
+fn writers_beyond_the_cap_are_read_once_others_have_departed() {
+    let mut domain = VirtualDomain::new(&[], Settings::default());
+    let crowd = GuidPrefix([5; 12]);
+    domain.participant(crowd, 100_000);
+    let log = |number: u16| {
+        let [high, low] = number.to_be_bytes();
+        Guid::new(crowd, EntityId([1, high, low, 3]))
+    };
+    for number in 0..1024 {
+        let payload = forge::endpoint(log(number), "rt/rosout", robot_log::DDS_TYPE, true);
+        domain.put(Message::from(crowd).data(SEDP_WRITERS, u64::from(number) + 1, &payload));
+    }
+    let mut robot = Robot::within(domain, "rt/diagnostics");
+    let fixed = Guid::new(PREFIX, EntityId([0, 0, 2, 3]));
+    let payload = forge::endpoint(fixed, "rt/tf_static", robot_transforms::DDS_TYPE, true);
+    let message = Message::from(PREFIX).data(SEDP_WRITERS, 2, &payload);
+    robot.domain.put(message);
+    robot.say(2, "not read");
+    robot.domain.wait(1000);
+    let snapshot = robot.domain.snapshot();
+    assert!(snapshot.diagnostics.statuses.is_empty());
+    assert_eq!(snapshot.transforms.trees[0].unread_static, 1);
+    let message = Message::from(PREFIX).dispose_by_hash(SEDP_WRITERS, 3, fixed);
+    robot.domain.put(message);
+    assert!(robot.domain.snapshot().transforms.trees.is_empty());
+
+    let message = Message::from(crowd).dispose_by_hash(SEDP_WRITERS, 2000, log(0));
+    robot.domain.put(message);
+    robot.domain.wait(1000);
+    robot.say(2, "read");
+    assert_eq!(&*robot.only().message, "read");
 }

@@ -142,6 +142,14 @@ impl Transforms {
         Ok(())
     }
 
+    /// Removes a departed writer of which no message was read.
+    pub(super) fn forget_unread(&mut self, writer: Guid) {
+        let known = self.broadcasters.get(&writer);
+        if known.is_some_and(|known| !known.is_received) {
+            self.broadcasters.remove(&writer);
+        }
+    }
+
     /// Removes what a departed writer broadcast.
     pub(super) fn forget(&mut self, writer: Guid) {
         self.broadcasters.remove(&writer);

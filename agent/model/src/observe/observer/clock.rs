@@ -174,6 +174,7 @@ impl Observer {
                 .update_locality(|prefix| self.graph.receivers.is_local(prefix));
             self.settle_inside(now);
             self.assign_free_slots();
+            self.read_refused_writers(now);
             self.end_second_of_losses();
             self.judge(now);
             self.advance_calls(now);
