@@ -168,6 +168,7 @@ impl Inside {
         self.processes.clear();
         self.participants.clear();
         self.topics.end();
+        self.late.end_findings();
     }
 
     /// Returns a number that increases with every change of [`Self::findings`].
