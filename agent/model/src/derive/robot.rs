@@ -29,7 +29,7 @@ use crate::derive::services::service::CallId;
 use crate::facts::bounded::{Bounded, Counted, TableFacts};
 use crate::facts::diagnosis::Diagnosis;
 use crate::facts::event::Events;
-use crate::facts::header::begins_with_header;
+use crate::facts::header::names_a_frame;
 use crate::facts::model_time::ModelTime;
 use crate::facts::names::{NodeName, TopicName, TypeName};
 use crate::facts::observation::Sample;
@@ -355,7 +355,7 @@ impl Robot {
                 .has(standard.part())
                 .then_some(Reading::Messages(standard)),
             None => {
-                let has_frame = parts.has(Part::Transforms) && begins_with_header(message_type);
+                let has_frame = parts.has(Part::Transforms) && names_a_frame(message_type);
                 has_frame.then_some(Reading::Frame)
             }
         }
