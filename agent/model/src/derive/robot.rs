@@ -349,7 +349,12 @@ impl Robot {
         parts: Parts,
     ) -> Option<Reading> {
         let is_wanted = || self.fields.cover(topic, message_type);
-        let standard = Standard::of(message_type);
+        // A recording may be replayed to another topic, such as `/tf_old`.
+        let is_read = |standard: &Standard| match standard {
+            Standard::Transforms => transforms::is_topic(topic),
+            _ => true,
+        };
+        let standard = Standard::of(message_type).filter(is_read);
         match standard.or_else(|| is_wanted().then_some(Standard::Fields)) {
             Some(standard) => parts
                 .has(standard.part())

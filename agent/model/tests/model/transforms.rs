@@ -152,6 +152,26 @@ fn static_and_moving_transforms_of_each_namespace_are_separate() {
 }
 
 #[test]
+fn transforms_on_other_topics_do_not_belong_to_the_robot() {
+    let mut robot = Robot::with(Settings::default(), ["rt/tf", "rt/tf_old"]);
+    for _ in 0..100 {
+        robot.broadcast(FIRST, "odom", "base_link", 1.0);
+        let old = Transform {
+            parent: "odom",
+            child: "base_link",
+            stamp: robot.now,
+            x: 50.0,
+            yaw: 0.0,
+        };
+        robot.send(SECOND, &[old]);
+        robot.wait(100);
+    }
+    assert_eq!((robot.faults(), robot.jumps()), (vec![], vec![]));
+    assert_eq!(robot.trees().len(), 1);
+    assert_eq!(robot.edge("base_link").count, 100);
+}
+
+#[test]
 fn a_silent_broadcaster_is_a_fault_and_a_removed_broadcaster_is_not() {
     let mut robot = Robot::new();
     robot.broadcast_for(FIRST, 5);

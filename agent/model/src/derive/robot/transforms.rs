@@ -357,10 +357,16 @@ impl Tree {
     }
 }
 
+/// Returns whether transforms on a topic belong to the robot: its last token is `tf` or `tf_static`.
+pub(super) fn is_topic(topic: &str) -> bool {
+    let name = topic.rsplit('/').next();
+    matches!(name, Some("tf" | "tf_static"))
+}
+
 /// Returns the namespace of a topic of transforms, and whether it has static ones.
 fn namespace(topic: &str) -> (&str, bool) {
     let (namespace, name) = topic.rsplit_once('/').unwrap_or(("", topic));
-    (namespace, name.ends_with("_static"))
+    (namespace, name == "tf_static")
 }
 
 /// Returns a frame without the leading slash of older names, which tf2 ignores.
