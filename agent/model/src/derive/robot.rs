@@ -32,7 +32,7 @@ use crate::facts::event::Events;
 use crate::facts::header::names_a_frame;
 use crate::facts::model_time::ModelTime;
 use crate::facts::names::{NodeName, TopicName, TypeName};
-use crate::facts::observation::Sample;
+use crate::facts::observation::{Path, Sample};
 use crate::facts::shared_memory::{MemoryFault, MemoryUse};
 use crate::facts::tables::RobotWriters;
 use crate::graph::discovery::Discovery;
@@ -164,6 +164,19 @@ struct RobotWriter {
     standard: Standard,
     allowance: WriterAllowance,
     read: ReadNumbers,
+    view: View,
+}
+
+/// How the last message of a writer was seen.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum View {
+    /// On an interface or at a socket.
+    Network,
+    /// In shared memory, by a probe that sees every message.
+    Exact,
+    /// In shared memory, by polling, or by a probe that was detached since. Further messages may
+    /// pass unseen.
+    Sampled,
 }
 
 /// What a sample of a followed writer changed.
@@ -389,6 +402,7 @@ impl Robot {
                 _ => WRITER_ALLOWANCE,
             }),
             read: ReadNumbers::default(),
+            view: View::Network,
         };
         self.has_refused |= self.writers.get_or_insert_with(writer, new).is_none();
         if standard == Standard::Transforms {
@@ -485,7 +499,14 @@ impl Robot {
         }
         let number = sample.sequence_number;
         let source = sample.source_timestamp.timestamp();
-        if known.read.has(number, source) {
+        let is_copy = known.read.has(number, source);
+        match sample.head.path {
+            Path::SharedMemory { exact: false } if is_copy => {}
+            Path::SharedMemory { exact: false } => known.view = View::Sampled,
+            Path::SharedMemory { exact: true } => known.view = View::Exact,
+            Path::Wire | Path::Socket | Path::Stream { .. } => known.view = View::Network,
+        }
+        if is_copy {
             return ReadOutcome::Nothing;
         }
         let standard = known.standard;
@@ -558,17 +579,39 @@ impl Robot {
         }
     }
 
-    /// Ends a second: unfinished messages and old errors expire. Returns the writers that are
-    /// captured again.
-    pub fn end_second(&mut self, now: ModelTime, events: &mut Events) -> Vec<Guid> {
+    /// Records that probes no longer see the messages in shared memory.
+    pub fn end_exact_view(&mut self) {
+        for known in self.writers.values_mut() {
+            if known.view == View::Exact {
+                known.view = View::Sampled;
+            }
+        }
+    }
+
+    /// Ends a second: unfinished messages and old errors expire. `is_hidden` returns whether all
+    /// messages of a writer pass through shared memory. Returns the writers that are captured again.
+    pub fn end_second(
+        &mut self,
+        now: ModelTime,
+        is_hidden: impl Fn(Guid) -> bool,
+        events: &mut Events,
+    ) -> Vec<Guid> {
         self.assembly.expire(now);
         self.logs.end_second();
-        let is_paused = |writer| {
+        // A writer that seems silent may be sending.
+        let is_unseen = |writer| {
             let known = self.writers.get(&writer);
-            known.is_some_and(|known: &RobotWriter| known.allowance.is_paused())
+            known.is_some_and(|known: &RobotWriter| {
+                known.allowance.is_paused()
+                    || match known.view {
+                        View::Network => is_hidden(writer),
+                        View::Exact => false,
+                        View::Sampled => true,
+                    }
+            })
         };
-        self.diagnostics.end_second(now, is_paused, events);
-        self.transforms.end_second(now, is_paused);
+        self.diagnostics.end_second(now, is_unseen, events);
+        self.transforms.end_second(now, is_unseen);
         self.frames.end_second(now, &self.transforms);
         self.lifecycle.end_second(now);
         self.parameters.end_second(now);

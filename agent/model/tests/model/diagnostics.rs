@@ -3,10 +3,11 @@
 use ros2probe_model::derive::robot::Parts;
 use ros2probe_model::facts::diagnosis::Diagnosis;
 use ros2probe_model::facts::event::EventKind;
+use ros2probe_model::observe::input::Input;
 use ros2probe_model::observe::observer::Settings;
 use ros2probe_model::report::snapshot::DiagnosticStatus;
 use ros2probe_testing::model::domain::VirtualDomain;
-use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS};
+use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe_testing::robot_diagnostics::{DDS_TYPE, Status, diagnostics};
 use ros2probe_testing::{robot_log, robot_transforms};
 use ros2probe_wire::diagnostics::DiagnosticLevel::{self, Error, Ok, Stale, Warn};
@@ -239,6 +240,78 @@ fn a_part_that_publishes_every_forty_seconds_is_never_stale() {
     }
     (0..90).for_each(|_| robot.domain.wait(1000));
     assert_eq!(robot.only().level, Stale);
+}
+
+#[test]
+fn a_part_of_which_polling_sees_few_messages_is_not_stale() {
+    let mut robot = Robot::new();
+    let status = Status {
+        level: 0,
+        name: LIDAR,
+        message: "text",
+        values: &[],
+    };
+    let message = |number: u64| {
+        let payload = diagnostics(&[status]);
+        Message::from(PREFIX).data(WRITER.entity, number, &payload)
+    };
+    for number in 1..=100 {
+        // Processes start, and a probe sees each message.
+        match number {
+            ..=10 => robot.domain.put_exact(message(number)),
+            11 => robot.domain.observer.input(Input::ProbesDetached),
+            _ if number % 8 == 0 => robot.domain.put_polled(message(number)),
+            _ => {}
+        }
+        robot.domain.wait(1000);
+    }
+    assert_eq!((robot.changes(), robot.findings()), (vec![], vec![]));
+}
+
+/// Returns the level of a part whose ten messages were passed with `put`, half a minute after
+/// `end`. Its only reader shares memory with the publisher.
+fn level_in_shared_memory(
+    put: impl Fn(&mut VirtualDomain, Message),
+    end: impl Fn(&mut VirtualDomain),
+) -> DiagnosticLevel {
+    let mut domain = VirtualDomain::new(&[], Settings::default());
+    let [writer, reader] = [(8, 3), (9, 4)].map(|(process, kind)| {
+        let prefix = GuidPrefix([1, 15, 3, 3, process, 0, 0, 0, 0, 0, 0, 1]);
+        Guid::new(prefix, EntityId([0, 0, 1, kind]))
+    });
+    for (guid, sedp) in [(writer, SEDP_WRITERS), (reader, SEDP_READERS)] {
+        let participant = forge::participant_on(guid.prefix, "machine", [10, 0, 0, 1]);
+        domain.put(Message::from_fast(guid.prefix).data(SPDP, 1, &participant));
+        let endpoint = forge::endpoint(guid, "rt/diagnostics", DDS_TYPE, true);
+        domain.put(Message::from_fast(guid.prefix).data(sedp, 1, &endpoint));
+    }
+    for number in 1..=10 {
+        let status = Status {
+            level: 0,
+            name: LIDAR,
+            message: "text",
+            values: &[],
+        };
+        let message = Message::from_fast(writer.prefix);
+        let message = message.data(writer.entity, number, &diagnostics(&[status]));
+        put(&mut domain, message);
+        domain.wait(1000);
+    }
+    end(&mut domain);
+    (0..30).for_each(|_| domain.wait(1000));
+    domain.snapshot().diagnostics.statuses[0].level
+}
+
+#[test]
+fn a_part_whose_messages_may_pass_unseen_in_shared_memory_is_not_stale() {
+    let nothing = |_: &mut VirtualDomain| {};
+    let detach = |domain: &mut VirtualDomain| domain.observer.input(Input::ProbesDetached);
+    assert_eq!(level_in_shared_memory(VirtualDomain::put_polled, nothing), Ok);
+    assert_eq!(level_in_shared_memory(VirtualDomain::put_exact, detach), Ok);
+    // The subscription on the network that received these is gone.
+    assert_eq!(level_in_shared_memory(VirtualDomain::put, nothing), Ok);
+    // A probe would see further messages.
+    assert_eq!(level_in_shared_memory(VirtualDomain::put_exact, nothing), Stale);
 }
 
 #[test]
