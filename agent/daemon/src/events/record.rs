@@ -177,7 +177,10 @@ impl Occurrence {
         let relieves = match self {
             Self::Robot(EventKind::Participant { change, .. }) => *change == churn::Event::Disposed,
             Self::Robot(EventKind::Lifecycle { to, .. }) => **to != *ERROR_PROCESSING,
-            Self::Robot(EventKind::Expectation { to, .. }) => *to == WatchState::Ok,
+            // Without a subscriber, most publishers send nothing.
+            Self::Robot(EventKind::Expectation { to, .. }) => {
+                matches!(to, WatchState::Ok | WatchState::NoSubscriber)
+            }
             Self::Robot(EventKind::Diagnostic { status, .. }) => {
                 status.level == DiagnosticLevel::Ok
             }

@@ -209,7 +209,7 @@ pub(super) const EXPECTATION_CHANGED: Definition = Definition::new(
     "ros2.topic.expectation_changed",
     Severity::Warn,
     &["domain_id", "topic", "watch", "from", "to", "violations"],
-    "The state of a watched topic changed; INFO if it is ok now.",
+    "The state of a watched topic changed; INFO if it is ok, or without a subscriber, now.",
 )
 .resolved_severity(Severity::Info);
 pub(super) const TOPIC_SILENT: Definition = Definition::new(

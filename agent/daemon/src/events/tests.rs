@@ -5,6 +5,7 @@ use ros2probe_wire::{DomainId, Guid};
 use super::*;
 use ros2probe_model::facts::churn;
 use ros2probe_model::facts::event::{Event, EventKind};
+use ros2probe_model::report::snapshot::WatchState;
 
 fn node(at: u64) -> Event {
     Event {
@@ -98,6 +99,39 @@ fn a_lifecycle_transition_is_a_warning_only_on_an_error() {
         ]
     );
     assert_eq!(batch.records[1].attribute("ros_node"), None);
+}
+
+#[test]
+fn a_topic_that_loses_its_only_subscriber_is_no_problem_and_no_trigger() {
+    let log = EventLog::new();
+    let changed = |from, to| Event {
+        kind: EventKind::Expectation {
+            domain_id: DomainId(7),
+            topic: "/scan".into(),
+            watch: "/scan".into(),
+            from: Some(from),
+            to,
+            violations: Vec::new(),
+        },
+        ..node(1)
+    };
+    let (ok, alone) = (WatchState::Ok, WatchState::NoSubscriber);
+    let states = [
+        (ok, alone),
+        (alone, ok),
+        (ok, WatchState::Silent),
+        (ok, WatchState::NotPublished),
+        (ok, WatchState::Violated),
+    ];
+    let events = states.map(|(from, to)| changed(from, to));
+    log.add(taken(events.into()), second(0));
+    let records = log.read(0, 10).records;
+    let severities: Vec<_> = records.iter().map(|each| each.severity).collect();
+    let (info, warn) = (Severity::Info, Severity::Warn);
+    assert_eq!(severities, [info, info, warn, warn, warn]);
+    let trigger = Trigger::parse("expectation").unwrap();
+    let triggers = records.iter().map(|record| trigger.matches(record, 7));
+    assert!(triggers.eq([false, false, true, true, true]));
 }
 
 #[test]

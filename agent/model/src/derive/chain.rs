@@ -215,6 +215,7 @@ impl Chains {
         let mut changed = BTreeSet::new();
         if self.built != built {
             self.built = built;
+            self.evidence.retain(|topic| topics.get(topic).is_some());
             self.graph = Graph::of(discovery, topics, share, is_local);
             changed = self.expected.route(discovery, topics);
         }

@@ -66,6 +66,8 @@ struct Peer {
     evidence: Evidence,
     /// The finding, as it began.
     offset_finding: Option<Range>,
+    /// Whether its clock was set in the last second.
+    has_stepped: bool,
     /// Nanoseconds that are added to latencies of its messages.
     correction: i64,
 }
@@ -230,17 +232,13 @@ impl Clocks {
     /// Ends a second: old evidence expires, steps of clocks are noticed, findings come and go.
     pub fn end_second(&mut self, now: ModelTime, clock: WallClock) {
         let before = self.peers.len();
-        self.peers.retain(|_, peer| peer.evidence.end_second(now));
+        self.peers.retain(|_, peer| peer.end_second(now));
         let mut changes = u64::from(self.peers.len() < before);
         for peer in self.peers.values_mut() {
             let range = peer.evidence.range(now, clock);
-            let least = range.map_or(0, |range| range.least_distance());
-            let is_apart = match peer.offset_finding {
-                Some(_) => least > MAX_OFFSET_OF_RESOLUTION,
-                None => least > MIN_OFFSET_OF_FINDING,
-            };
-            if is_apart != peer.offset_finding.is_some() {
-                peer.offset_finding = range.filter(|_| is_apart);
+            let found = peer.finding(range);
+            if found != peer.offset_finding {
+                peer.offset_finding = found;
                 changes += 1;
             }
         }
@@ -348,6 +346,29 @@ impl Clocks {
             (*address, name.unwrap_or_else(|| address.to_string().into()))
         };
         self.peers.iter().map(label).collect()
+    }
+}
+
+impl Peer {
+    /// Ends a second of the evidence. Returns false once all evidence has expired.
+    fn end_second(&mut self, now: ModelTime) -> bool {
+        let steps = self.evidence.steps();
+        let lives = self.evidence.end_second(now);
+        self.has_stepped = self.evidence.steps() > steps;
+        lives
+    }
+
+    /// Returns the finding, as it began. It stays while the offset is unknown, because evidence
+    /// expires and the clock does not change. It ends if the clock was set.
+    fn finding(&self, range: Option<Range>) -> Option<Range> {
+        let Some(range) = range else {
+            return self.offset_finding.filter(|_| !self.has_stepped);
+        };
+        let least = range.least_distance();
+        match self.offset_finding {
+            Some(begun) => (least > MAX_OFFSET_OF_RESOLUTION).then_some(begun),
+            None => (least > MIN_OFFSET_OF_FINDING).then_some(range),
+        }
     }
 }
 

@@ -234,8 +234,10 @@ impl Findings {
     }
 
     fn finish(mut self) -> Diagnoses {
+        // The second sort is stable, so findings with one identity keep a fixed order.
         self.list.sort_unstable();
         self.list.dedup();
+        self.list.sort_by(Diagnosis::cmp_identity);
         let more = self.qos_pairs.len().saturating_sub(MAX_QOS_PAIRS);
         self.qos_pairs.truncate(MAX_QOS_PAIRS);
         Diagnoses {
@@ -259,7 +261,67 @@ fn partly_known_domains(discovery: &Discovery) -> BTreeSet<DomainId> {
 
 #[cfg(test)]
 mod tests {
+    use ros2probe_wire::diagnostics::DiagnosticLevel;
+
     use super::*;
+    use crate::facts::diagnosis::{Change, changes};
+    use crate::facts::robot::{TransformFault, TransformFaultKind};
+    use crate::facts::shared_memory::MemoryFault;
+
+    /// Returns findings whose details are in another order than their identities.
+    fn findings() -> Vec<Diagnosis> {
+        let error = |node: &str, name: &str| Diagnosis::DiagnosticError {
+            domain_id: DomainId(0),
+            topic: "/diagnostics".into(),
+            node: Some(node.into()),
+            name: name.into(),
+            hardware_id: "".into(),
+            level: DiagnosticLevel::Error,
+            message: "".into(),
+        };
+        let memory = |fault| Diagnosis::SharedMemoryFault { fault, figure: 1 };
+        let transform = |parent: &str, kind| Diagnosis::TransformFault {
+            domain_id: DomainId(0),
+            namespace: "".into(),
+            fault: TransformFault {
+                child: "base_link".into(),
+                parent: parent.into(),
+                kind,
+                edges: 1,
+                names: Vec::new(),
+            },
+        };
+        vec![
+            error("/base", "motor"),
+            error("/camera", "cam"),
+            error("/camera", "lens"),
+            transform("map", TransformFaultKind::Jumps),
+            transform("odom", TransformFaultKind::Silent),
+            transform("", TransformFaultKind::UnknownFrame),
+            memory(MemoryFault::Full),
+            memory(MemoryFault::Stale),
+            memory(MemoryFault::Split),
+        ]
+    }
+
+    fn finished(list: impl Iterator<Item = Diagnosis>) -> Vec<Diagnosis> {
+        let mut findings = Findings::new();
+        list.for_each(|finding| findings.add(finding));
+        findings.finish().list
+    }
+
+    #[test]
+    fn a_finding_that_ends_changes_no_other() {
+        let all = finished(findings().into_iter());
+        assert!(all.is_sorted_by(|one, next| one.cmp_identity(next) == Ordering::Less));
+        for ended in findings() {
+            let rest = finished(findings().into_iter().filter(|each| *each != ended));
+            let seen: Vec<_> = changes(&all, &rest).collect();
+            assert_eq!(seen, [Change::Resolved(&ended)]);
+            let seen: Vec<_> = changes(&rest, &all).collect();
+            assert_eq!(seen, [Change::Appeared(&ended)]);
+        }
+    }
 
     #[test]
     fn a_finding_keeps_its_time_when_its_text_changes() {

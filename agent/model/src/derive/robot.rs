@@ -29,9 +29,10 @@ use crate::derive::services::service::CallId;
 use crate::facts::bounded::{Bounded, Counted, TableFacts};
 use crate::facts::diagnosis::Diagnosis;
 use crate::facts::event::Events;
+use crate::facts::header::names_a_frame;
 use crate::facts::model_time::ModelTime;
 use crate::facts::names::{NodeName, TopicName, TypeName};
-use crate::facts::observation::Sample;
+use crate::facts::observation::{Path, Sample};
 use crate::facts::shared_memory::{MemoryFault, MemoryUse};
 use crate::facts::tables::RobotWriters;
 use crate::graph::discovery::Discovery;
@@ -108,6 +109,15 @@ pub enum Standard {
     Fields,
 }
 
+/// What is read of a writer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Reading {
+    /// Its messages, which are of this type.
+    Messages(Standard),
+    /// The frame in the header of one message.
+    Frame,
+}
+
 /// What the configuration expects of a robot, and wants to know about it.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct RobotExpectations {
@@ -123,6 +133,8 @@ pub struct RobotExpectations {
 #[derive(Debug)]
 pub struct Robot {
     writers: Bounded<Counted<RobotWriters>, HashMap<Guid, RobotWriter>>,
+    /// Whether a full table refused a writer since [`Robot::retry`].
+    has_refused: bool,
     assembly: Assembly,
     allowances: Allowances,
     logs: Logs,
@@ -152,6 +164,19 @@ struct RobotWriter {
     standard: Standard,
     allowance: WriterAllowance,
     read: ReadNumbers,
+    view: View,
+}
+
+/// How the last message of a writer was seen.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum View {
+    /// On an interface or at a socket.
+    Network,
+    /// In shared memory, by a probe that sees every message.
+    Exact,
+    /// In shared memory, by polling, or by a probe that was detached since. Further messages may
+    /// pass unseen.
+    Sampled,
 }
 
 /// What a sample of a followed writer changed.
@@ -285,6 +310,7 @@ impl Default for Robot {
     fn default() -> Self {
         Self {
             writers: Bounded::default(),
+            has_refused: false,
             assembly: Assembly::new(ASSEMBLY_BYTES),
             allowances: Allowances {
                 transforms: CommonAllowance::new(COMMON_BROADCASTER_ALLOWANCE, RESUME_BYTES),
@@ -327,25 +353,46 @@ impl Robot {
         }
     }
 
-    /// Returns how messages of this type on this topic are read; `None` if they are not.
+    /// Returns what is read of writers of this type on this topic; `None` if nothing is.
     #[must_use]
-    pub fn standard(&self, topic: &TopicName, message_type: &TypeName) -> Option<Standard> {
+    pub fn reading(
+        &self,
+        topic: &TopicName,
+        message_type: &TypeName,
+        parts: Parts,
+    ) -> Option<Reading> {
         let is_wanted = || self.fields.cover(topic, message_type);
-        Standard::of(message_type).or_else(|| is_wanted().then_some(Standard::Fields))
+        // A recording may be replayed to another topic, such as `/tf_old`.
+        let is_read = |standard: &Standard| match standard {
+            Standard::Transforms => transforms::is_topic(topic),
+            _ => true,
+        };
+        let standard = Standard::of(message_type).filter(is_read);
+        match standard.or_else(|| is_wanted().then_some(Standard::Fields)) {
+            Some(standard) => parts
+                .has(standard.part())
+                .then_some(Reading::Messages(standard)),
+            None => {
+                let has_frame = parts.has(Part::Transforms) && names_a_frame(message_type);
+                has_frame.then_some(Reading::Frame)
+            }
+        }
     }
 
-    /// Begins to wait for one message of this writer, for the frame in its header.
-    pub fn follow_frame(&mut self, writer: Guid, domain_id: DomainId, topic: &TopicName) {
-        self.frames.follow(writer, domain_id, topic);
-    }
-
-    /// Begins to read this writer, unless the table of writers is full.
+    /// Begins to read this writer, unless the table of such writers is full.
     pub fn follow(
         &mut self,
         writer: Guid,
         (domain_id, topic): (DomainId, &TopicName),
-        standard: Standard,
+        reading: Reading,
     ) {
+        let standard = match reading {
+            Reading::Messages(standard) => standard,
+            Reading::Frame => {
+                self.has_refused |= !self.frames.follow(writer, domain_id, topic);
+                return;
+            }
+        };
         let new = || RobotWriter {
             domain_id,
             topic: topic.clone(),
@@ -355,16 +402,42 @@ impl Robot {
                 _ => WRITER_ALLOWANCE,
             }),
             read: ReadNumbers::default(),
+            view: View::Network,
         };
-        self.writers.get_or_insert_with(writer, new);
+        self.has_refused |= self.writers.get_or_insert_with(writer, new).is_none();
         if standard == Standard::Transforms {
+            // A static broadcaster that is refused counts as unread.
             self.transforms.follow(writer, domain_id, topic);
         }
+    }
+
+    /// Returns whether a table refused a writer, and one has room again. The caller should then
+    /// call [`Self::follow`] for each writer that [`Self::has_place_for`] admits.
+    #[must_use]
+    pub fn may_retry(&self) -> bool {
+        self.has_refused && !(self.writers.is_full() && self.frames.is_full())
+    }
+
+    /// Begins a retry. Writers that are refused from now on cause another one.
+    pub const fn retry(&mut self) {
+        self.has_refused = false;
+    }
+
+    /// Returns whether the writer is not followed and its table has room. A table without room
+    /// counts as one that refused the writer.
+    pub fn has_place_for(&mut self, writer: Guid, reading: Reading) -> bool {
+        let (is_known, is_full) = match reading {
+            Reading::Messages(_) => (self.writers.contains_key(&writer), self.writers.is_full()),
+            Reading::Frame => (self.frames.knows(writer), self.frames.is_full()),
+        };
+        self.has_refused |= !is_known && is_full;
+        !is_known && !is_full
     }
 
     /// Stops reading this writer.
     pub fn forget(&mut self, writer: Guid) {
         self.frames.forget(writer);
+        self.transforms.forget_unread(writer);
         if let Some(known) = self.writers.remove(&writer) {
             self.allowances.of(known.standard).forget(&known.allowance);
             self.assembly.release(writer);
@@ -426,7 +499,14 @@ impl Robot {
         }
         let number = sample.sequence_number;
         let source = sample.source_timestamp.timestamp();
-        if known.read.has(number, source) {
+        let is_copy = known.read.has(number, source);
+        match sample.head.path {
+            Path::SharedMemory { exact: false } if is_copy => {}
+            Path::SharedMemory { exact: false } => known.view = View::Sampled,
+            Path::SharedMemory { exact: true } => known.view = View::Exact,
+            Path::Wire | Path::Socket | Path::Stream { .. } => known.view = View::Network,
+        }
+        if is_copy {
             return ReadOutcome::Nothing;
         }
         let standard = known.standard;
@@ -499,17 +579,39 @@ impl Robot {
         }
     }
 
-    /// Ends a second: unfinished messages and old errors expire. Returns the writers that are
-    /// captured again.
-    pub fn end_second(&mut self, now: ModelTime, events: &mut Events) -> Vec<Guid> {
+    /// Records that probes no longer see the messages in shared memory.
+    pub fn end_exact_view(&mut self) {
+        for known in self.writers.values_mut() {
+            if known.view == View::Exact {
+                known.view = View::Sampled;
+            }
+        }
+    }
+
+    /// Ends a second: unfinished messages and old errors expire. `is_hidden` returns whether all
+    /// messages of a writer pass through shared memory. Returns the writers that are captured again.
+    pub fn end_second(
+        &mut self,
+        now: ModelTime,
+        is_hidden: impl Fn(Guid) -> bool,
+        events: &mut Events,
+    ) -> Vec<Guid> {
         self.assembly.expire(now);
         self.logs.end_second();
-        let is_paused = |writer| {
+        // A writer that seems silent may be sending.
+        let is_unseen = |writer| {
             let known = self.writers.get(&writer);
-            known.is_some_and(|known: &RobotWriter| known.allowance.is_paused())
+            known.is_some_and(|known: &RobotWriter| {
+                known.allowance.is_paused()
+                    || match known.view {
+                        View::Network => is_hidden(writer),
+                        View::Exact => false,
+                        View::Sampled => true,
+                    }
+            })
         };
-        self.diagnostics.end_second(now, is_paused, events);
-        self.transforms.end_second(now, is_paused);
+        self.diagnostics.end_second(now, is_unseen, events);
+        self.transforms.end_second(now, is_unseen);
         self.frames.end_second(now, &self.transforms);
         self.lifecycle.end_second(now);
         self.parameters.end_second(now);

@@ -28,6 +28,11 @@ const WINDOW: Duration = Duration::from_secs(30);
 const DRIFTING_WINDOWS: usize = 4;
 /// Least drift from one window to the next, in nanoseconds: 33 ppm.
 const MIN_DRIFT_NANOSECONDS: i64 = 1_000_000;
+/// Minimum number of messages in a window: the least age of fewer ones is chance.
+const MIN_WINDOW_MESSAGES: u32 = 20;
+/// The drift from one window to the next exceeds this many times the distance between the two least
+/// ages of any window, because the least age varies by about that distance.
+const DRIFT_FACTOR: i64 = 2;
 
 /// The stamps of all publishers whose messages are measured and begin with a header.
 #[derive(Debug, Default)]
@@ -47,12 +52,21 @@ struct StampWriter {
     other_clock: Streak,
     /// Time and distance of the last stamp that went back.
     back: Option<(ModelTime, i64)>,
-    /// Start of the present window, and the least age in it.
-    window: (ModelTime, Option<i64>),
-    /// Least ages of the last windows.
-    least: VecDeque<i64>,
+    /// Start of the present window, and the ages in it.
+    window: (ModelTime, Ages),
+    /// Ages of the last windows.
+    least: VecDeque<Ages>,
     /// The fault that is reported.
     reported: Option<(StampFault, i64)>,
+}
+
+/// Ages of the stamps of one window, in nanoseconds.
+#[derive(Clone, Copy, Debug)]
+struct Ages {
+    messages: u32,
+    least: i64,
+    /// The least age but one.
+    next: i64,
 }
 
 /// A condition that begins and ends after some messages in a row.
@@ -87,7 +101,7 @@ impl Stamps {
                 future: Streak::default(),
                 other_clock: Streak::default(),
                 back: None,
-                window: (at, None),
+                window: (at, Ages::default()),
                 least: VecDeque::new(),
                 reported: None,
             };
@@ -171,8 +185,7 @@ impl StampWriter {
         {
             self.back = Some((at, last_stamp.nanoseconds_since(stamp)));
         }
-        let least = &mut self.window.1;
-        *least = Some(least.map_or(age, |least| least.min(age)));
+        self.window.1.add(age);
     }
 
     fn fault(
@@ -196,14 +209,15 @@ impl StampWriter {
         if now - self.window.0 < WINDOW {
             return;
         }
-        match self.window.1.take() {
-            Some(least) => self.least.push_back(least),
-            None => self.least.clear(),
+        let (_, ages) = std::mem::replace(&mut self.window, (now, Ages::default()));
+        if ages.messages < MIN_WINDOW_MESSAGES {
+            self.least.clear();
+            return;
         }
+        self.least.push_back(ages);
         if self.least.len() > DRIFTING_WINDOWS + 1 {
             self.least.pop_front();
         }
-        self.window.0 = now;
     }
 
     /// Returns the drift of the least age from the first to the last window, if it goes in one
@@ -213,11 +227,41 @@ impl StampWriter {
             return None;
         }
         let steps = self.least.iter().zip(self.least.iter().skip(1));
-        let steps: Vec<_> = steps.map(|(before, after)| after - before).collect();
-        let is_steady = steps.iter().all(|step| *step >= MIN_DRIFT_NANOSECONDS)
-            || steps.iter().all(|step| *step <= -MIN_DRIFT_NANOSECONDS);
+        let steps: Vec<_> = steps
+            .map(|(before, after)| after.least - before.least)
+            .collect();
+        let distance = self.least.iter().map(Ages::distance).max();
+        let chance = distance.unwrap_or(0).saturating_mul(DRIFT_FACTOR);
+        let minimum = MIN_DRIFT_NANOSECONDS.max(chance);
+        let is_steady = steps.iter().all(|step| *step >= minimum)
+            || steps.iter().all(|step| *step <= -minimum);
         let sum: i64 = steps.iter().sum();
         is_steady.then_some((StampFault::Drifting, sum))
+    }
+}
+
+impl Ages {
+    fn add(&mut self, age: i64) {
+        self.messages = self.messages.saturating_add(1);
+        (self.least, self.next) = match age < self.least {
+            true => (age, self.least),
+            false => (self.least, self.next.min(age)),
+        };
+    }
+
+    /// Returns the distance between the two least ages.
+    const fn distance(&self) -> i64 {
+        self.next.saturating_sub(self.least)
+    }
+}
+
+impl Default for Ages {
+    fn default() -> Self {
+        Self {
+            messages: 0,
+            least: i64::MAX,
+            next: i64::MAX,
+        }
     }
 }
 
@@ -232,5 +276,62 @@ impl Streak {
             self.count = 0;
             self.value = holds.then_some(value);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::facts::topic_kind::TopicKind;
+
+    /// Publishes for a day, one message each `interval` seconds, with ages from `age`. Returns
+    /// whether they were ever a drift.
+    fn drifts(interval: u64, mut age: impl FnMut(u64) -> u64) -> bool {
+        const START: u64 = 1_795_143_000;
+        let mut stamps = Stamps::default();
+        let mut has_drifted = false;
+        for second in 0..86_400 {
+            let now = (START + second) * SECOND;
+            let at = ModelTime::from_nanoseconds(now);
+            if second.is_multiple_of(interval) {
+                let stamp = now - age(second);
+                let nanoseconds = u32::try_from(stamp % SECOND).unwrap();
+                let stamp = (i32::try_from(stamp / SECOND).unwrap(), nanoseconds);
+                let number = SequenceNumber(second + 1);
+                stamps.add((Guid::default(), number), (stamp, Timestamp(now)), at, || {
+                    Some(TopicKey {
+                        domain_id: DomainId(0),
+                        dds_name: "rt/map".into(),
+                        name: "/map".into(),
+                        kind: TopicKind::Topic,
+                    })
+                });
+            }
+            stamps.end_second(at, std::iter::empty());
+            let is_drift = |found: &Diagnosis| {
+                let fault = StampFault::Drifting;
+                matches!(found, Diagnosis::WrongStamps { fault: found, .. } if *found == fault)
+            };
+            has_drifted |= stamps.findings().any(|found| is_drift(&found));
+        }
+        has_drifted
+    }
+
+    #[test]
+    fn random_ages_are_not_a_drift() {
+        for (interval, range) in [(5, 100), (1, 100), (1, 1000), (1, 20)] {
+            let mut dice = 1_u64;
+            let random = |_| {
+                dice = dice.wrapping_mul(6_364_136_223_846_793_005) + 1;
+                50_000_000 + (dice >> 33) % (range * 1_000_000)
+            };
+            assert!(!drifts(interval, random), "{interval} s, {range} ms");
+        }
+    }
+
+    #[test]
+    fn ages_that_grow_at_one_hertz_are_a_drift() {
+        // 100 µs a second, and each message up to 1 ms late.
+        assert!(drifts(1, |second| second * 100_000 + second * 7 % 11 * 100_000));
     }
 }

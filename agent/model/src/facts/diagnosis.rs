@@ -58,7 +58,7 @@ impl TopicKey {
     }
 }
 
-/// A finding. The first fields of a variant identify it; the last one may change.
+/// A finding. [`Diagnosis::cmp_identity`] compares the fields that identify it; the others may change.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Diagnosis {
     /// A writer and a reader of one topic and type do not match because of their QoS.
@@ -417,7 +417,7 @@ pub struct QosPairs {
 /// All findings.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Diagnoses {
-    /// Findings, sorted and without duplicates.
+    /// Findings, sorted by [`Diagnosis::cmp_identity`] and without duplicates.
     pub list: Vec<Diagnosis>,
     /// Complete counts of incompatible pairs, sorted by topic and policy.
     pub qos_pairs: Vec<QosPairs>,
@@ -544,8 +544,8 @@ impl Diagnosis {
         }
     }
 
-    /// Compares identities only, without details. The result is consistent with the order of the
-    /// list.
+    /// Compares identities only, without details. This is the order of the list: in another order,
+    /// [`changes`] would report a finding that still exists as resolved.
     #[must_use]
     pub fn cmp_identity(&self, other: &Self) -> Ordering {
         let place = |diagnosis: &Self| {
@@ -694,7 +694,8 @@ impl Unmatched {
     }
 }
 
-/// Returns the differences between two sorted lists, in the order of the lists.
+/// Returns the differences between two lists that are sorted by [`Diagnosis::cmp_identity`], in the
+/// order of the lists.
 pub fn changes<'a>(
     before: &'a [Diagnosis],
     after: &'a [Diagnosis],
@@ -791,7 +792,7 @@ mod tests {
                 domains: vec![DomainId(0), DomainId(5)],
             },
         ];
-        all.sort();
+        all.sort_by(Diagnosis::cmp_identity);
         let ordered = all.is_sorted_by(|one, other| one.cmp_identity(other) == Ordering::Less);
         assert!(ordered);
         for kind in all.iter().map(Diagnosis::kind) {

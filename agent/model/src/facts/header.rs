@@ -1,5 +1,7 @@
 //! ROS types that begin with a `std_msgs/Header`, and the plausibility of its stamp.
 //!
+//! The frame in a header is a place on the robot, except for some types.
+//!
 //! Message definitions are not available while messages are measured, so this module lists the
 //! types of the common interface packages that begin with a header. Other types have no header
 //! latency. Implausible stamps, such as simulated time or an unset header, are ignored.
@@ -64,6 +66,23 @@ const SENSOR_PARTS: [&str; 7] = [
     "RegionOfInterest",
 ];
 
+/// Types whose header has a stamp, and a frame that is no place: the name of a device or a clock.
+const WITHOUT_PLACE: [&str; 7] = [
+    "actionlib_msgs/msg/GoalStatusArray",
+    "can_msgs/msg/Frame",
+    "mavros_msgs/msg/State",
+    "nmea_msgs/msg/Sentence",
+    "sensor_msgs/msg/BatteryState",
+    "sensor_msgs/msg/Joy",
+    "sensor_msgs/msg/TimeReference",
+];
+
+/// Returns whether the header of this ROS type names a frame of the robot.
+#[must_use]
+pub fn names_a_frame(message_type: &str) -> bool {
+    begins_with_header(message_type) && WITHOUT_PLACE.binary_search(&message_type).is_err()
+}
+
 /// Returns whether messages of this ROS type begin with a header.
 #[must_use]
 pub fn begins_with_header(message_type: &str) -> bool {
@@ -106,6 +125,16 @@ mod tests {
         ] {
             assert!(!begins_with_header(name), "{name}");
         }
+    }
+
+    #[test]
+    fn headers_of_devices_without_a_place_name_no_frame() {
+        assert!(WITHOUT_PLACE.is_sorted());
+        for name in WITHOUT_PLACE {
+            assert!(begins_with_header(name) && !names_a_frame(name), "{name}");
+        }
+        assert!(names_a_frame("sensor_msgs/msg/Image"));
+        assert!(!names_a_frame("std_msgs/msg/String"));
     }
 
     #[test]

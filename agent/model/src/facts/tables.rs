@@ -149,7 +149,7 @@ crate::tables! {
         effect: "the participant with the most bytes loses its oldest message",
     }
     /// Writers of standard types that the agent reads
-    RobotWriters { name: "robot_writers", entries: 1024, effect: "it is not read" }
+    RobotWriters { name: "robot_writers", entries: 1024, effect: "it is not read until another departs" }
     /// Parts of the robot with diagnostics
     DiagnosticsTable { name: "diagnostics", entries: 1024, effect: "the one with the longest silence is dropped" }
     /// Bytes of the values of diagnostics
@@ -175,7 +175,7 @@ crate::tables! {
     /// Managed nodes whose lifecycle state is known from their topic
     ManagedNodes { name: "robot_managed_nodes", entries: 256, effect: "its state is not shown" }
     /// Writers of which one message with a header is read
-    FrameWriters { name: "robot_frames", entries: 512, effect: "its frame is not compared with the transforms" }
+    FrameWriters { name: "robot_frames", entries: 512, effect: "its frame is not compared with the transforms until another departs" }
     /// Writers whose last message is kept, because its fields have metrics
     FieldMessages { name: "robot_fields", entries: 64, effect: "its fields have no metrics" }
     /// Bytes of these messages

@@ -4,6 +4,8 @@
 //! `BAD` bad evaluations in a row and recovers after `EVALUATIONS_TO_RECOVER` good ones. Rates are
 //! evaluated over a window of at least three expected messages (1 to 10 s), or over the window of
 //! the entry. One message of tolerance at the window's edges keeps a healthy periodic topic stable.
+//! If less than one message is due in the window, `min_rate_hz` is evaluated as a silence of
+//! `SLOW_TOPIC_INTERVALS` intervals.
 //! Latency is that of the last second. A second without a message keeps the verdict of the last two
 //! with messages, so that a slow topic needs two late ones. Silence has its own time and no
 //! hysteresis. A silence between two messages, which ended before it was evaluated, violates at
@@ -35,6 +37,9 @@ const EVALUATIONS_TO_VIOLATE: u8 = 2;
 const EVALUATIONS_TO_RECOVER: u8 = 3;
 /// Number of evaluations after a silence in which its end is no silence of its own.
 const SILENCE_END_EVALUATIONS: u8 = 2;
+/// Expected intervals without a message after which a rate below one message in its window is
+/// violated.
+const SLOW_TOPIC_INTERVALS: f64 = 1.5;
 /// Seconds from a topic's first publisher until the numbers of its endpoints are evaluated.
 pub const STARTUP_GRACE_SECONDS: u64 = 10;
 const EXPECTATION_NAMES: [&str; 7] = [
@@ -166,7 +171,9 @@ impl TopicEvaluation {
         let is_silent = self.state == WatchState::Silent;
         let broken = violated_bits(expectations, evidence, is_silent)
             | self.latency_bit(expectations, evidence);
-        let quiet = broken & MAX_SILENCE != 0 || evidence.last_message.is_none();
+        let quiet = broken & MAX_SILENCE != 0
+            || broken & MIN_RATE != 0 && longest_interval(expectations).is_some()
+            || evidence.last_message.is_none();
         let broken = without_subscriber_effects(broken, quiet, evidence);
         let silent = broken & MAX_SILENCE != 0;
         let has_gap = !silent
@@ -250,12 +257,16 @@ impl TopicEvaluation {
 fn violated_bits(expectations: &Expectations, evidence: &Evidence<'_>, is_silent: bool) -> u8 {
     let mut broken = 0;
     let rates = |rate: f64| {
-        let window = expectations
-            .window_s
-            .map_or_else(|| window(rate), u64::from);
+        let window = window_of(expectations, rate);
         (evidence.recent)(window.min(evidence.observed_seconds()))
     };
-    if let Some(minimum) = expectations.min_rate_hz {
+    if let Some((expected, longest)) = longest_interval(expectations) {
+        let last = evidence.last_message.unwrap_or_default();
+        let silence = evidence.now - last.max(evidence.observed);
+        if silence > longest.max((evidence.max_unseen_time)(expected)) {
+            broken |= MIN_RATE;
+        }
+    } else if let Some(minimum) = expectations.min_rate_hz {
         let (slot, seconds) = rates(minimum);
         let known = seconds as f64 - evidence.unknown_seconds(minimum).min(seconds as f64);
         if known > 0.0 && (slot.messages + 1) as f64 <= minimum * known {
@@ -295,6 +306,25 @@ fn violated_bits(expectations: &Expectations, evidence: &Evidence<'_>, is_silent
         }
     }
     broken
+}
+
+/// Returns the number of seconds over which a rate is evaluated.
+fn window_of(expectations: &Expectations, rate: f64) -> u64 {
+    let configured = expectations.window_s;
+    configured.map_or_else(|| window(rate), u64::from)
+}
+
+/// Returns the interval that `min_rate_hz` expects, and the longest one that it permits; `None` if
+/// its window is long enough to count messages.
+#[expect(clippy::cast_precision_loss, reason = "a window has at most ten seconds")]
+fn longest_interval(expectations: &Expectations) -> Option<(Duration, Duration)> {
+    let minimum = expectations.min_rate_hz.filter(|minimum| *minimum > 0.0)?;
+    let interval = |seconds: f64| Duration::try_from_secs_f64(seconds).unwrap_or(Duration::MAX);
+    let is_slow = minimum * (window_of(expectations, minimum) as f64) < 1.0;
+    is_slow.then(|| {
+        let longest = interval(SLOW_TOPIC_INTERVALS / minimum);
+        (interval(1.0 / minimum), longest)
+    })
 }
 
 /// Removes the violations that follow from the absence of all subscribers.
@@ -604,6 +634,48 @@ mod tests {
         let states = [(); 7].map(|()| bench.second(rate(0)));
         let (ok, bad) = (WatchState::Ok, WatchState::Violated);
         assert_eq!(states, [ok, ok, bad, bad, bad, bad, bad]);
+    }
+
+    /// Evaluates these seconds of a topic that has a message every `period` of them.
+    fn slow_seconds(bench: &mut Bench, seconds: u64, period: u64) -> Vec<WatchState> {
+        let each = |second: u64| bench.second(rate(u64::from(second.is_multiple_of(period))));
+        (1..=seconds).map(each).collect()
+    }
+
+    #[test]
+    fn a_rate_below_a_message_in_its_window_is_violated_by_one_and_a_half_intervals() {
+        let (ok, bad) = (WatchState::Ok, WatchState::Violated);
+        for (minimum, window_s, interval) in [(0.025, None, 40), (0.08, None, 12), (0.5, Some(1), 2)]
+        {
+            let mut bench = Bench::new(Expectations {
+                min_rate_hz: Some(minimum),
+                window_s,
+                ..Expectations::default()
+            });
+            let states = slow_seconds(&mut bench, 5 * interval, interval);
+            assert!(states.iter().all(|state| *state == ok), "{minimum}");
+            let permitted = usize::try_from(interval * 3 / 2).unwrap();
+            let states = slow_seconds(&mut bench, 3 * interval, u64::MAX);
+            let first = states.iter().position(|state| *state == bad);
+            // Two evaluations in a row cause a violation.
+            assert_eq!(first, Some(permitted + 1), "{minimum}");
+            assert_eq!(bench.judgement.violations(), ["min_rate_hz"]);
+            let states = [1, 0, 0].map(|messages| bench.second(rate(messages)));
+            assert_eq!(states, [bad, bad, ok], "{minimum}");
+        }
+    }
+
+    #[test]
+    fn a_slow_topic_that_is_quiet_without_a_subscriber_violates_nothing() {
+        let mut bench = Bench::new(Expectations {
+            min_rate_hz: Some(0.05),
+            ..Expectations::default()
+        });
+        assert_eq!(bench.second(rate(1)), WatchState::Ok);
+        bench.subscriptions = 0;
+        let states = slow_seconds(&mut bench, 60, u64::MAX);
+        assert!(!states.contains(&WatchState::Violated));
+        assert_eq!(bench.judgement.state(), WatchState::NoSubscriber);
     }
 
     #[test]

@@ -262,7 +262,10 @@ impl Observer {
                 let at = self.graph.wall_clock.model_time(at);
                 self.measure.profiler.missed(destination, at);
             }
-            Input::ProbesDetached => self.measure.profiler.end_exact_view(),
+            Input::ProbesDetached => {
+                self.measure.profiler.end_exact_view();
+                self.derive.robot.end_exact_view();
+            }
             Input::Link(report) => {
                 let now = self.clock;
                 self.measure.links.report(report, now);

@@ -287,6 +287,30 @@ fn one_acknowledgement_bounds_the_clock_for_ten_minutes() {
     assert_eq!(hear_for(150), [], "the network may be another one");
 }
 
+#[test]
+fn a_finding_outlives_its_evidence_until_the_clock_is_set_or_the_offset_is_known() {
+    let ahead = Clock::ahead(1_000_000_000);
+    let mut pair = Pair::new();
+    pair.send_from_bob();
+    pair.listen(ahead, 10);
+    let begun = pair.finding();
+    assert!(begun.is_some_and(|offset| offset > 990_000_000), "{begun:?}");
+    // The round trip expires after ten minutes.
+    pair.listen(ahead, 15 * 60);
+    assert!(pair.offsets().is_empty());
+    assert_eq!(pair.finding(), begun);
+    pair.talk(Clock::ahead(1_000_000_000), 10, |_| {});
+    assert_eq!(pair.finding(), begun);
+    pair.listen(Clock::ahead(0), 15);
+    assert_eq!((pair.finding(), pair.peer().steps), (None, 1));
+    // A finding also ends once the offset is known to be small.
+    let mut pair = Pair::new();
+    pair.talk(Clock::ahead(12_000_000), 10, |_| {});
+    assert!(pair.finding().is_some());
+    pair.talk(Clock::ahead(0), 60, |_| {});
+    assert_eq!(pair.finding(), None);
+}
+
 /// A writer of Fast DDS announces its messages each 3 s, long after the last of them.
 #[test]
 fn the_heartbeat_that_requests_an_acknowledgement_begins_a_round_trip() {

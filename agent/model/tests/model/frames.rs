@@ -33,6 +33,8 @@ impl Robot {
             (2, "rt/front", IMAGE),
             (3, "rt/rear", IMAGE),
             (4, "rt/text", "std_msgs::msg::dds_::String_"),
+            (5, "rt/joy", "sensor_msgs::msg::dds_::Joy_"),
+            (6, "rt/can", "can_msgs::msg::dds_::Frame_"),
         ] {
             let payload = forge::endpoint(writer(number), topic, type_name, true);
             domain.put(Message::from(PREFIX).data(SEDP_WRITERS, number.into(), &payload));
@@ -96,6 +98,16 @@ fn a_frame_that_no_transform_has_is_a_finding_with_its_topics() {
     assert_eq!(robot.unknown(4_000), [expected]);
     robot.broadcast("camera");
     assert_eq!(robot.unknown(1_000), []);
+}
+
+#[test]
+fn the_names_of_devices_are_no_frames() {
+    let mut robot = Robot::new();
+    assert_eq!(robot.verdict(writer(5)), Some(Verdict::Ignore));
+    robot.broadcast("base_link");
+    robot.send(writer(5), &with_header("joy", 100));
+    robot.send(writer(6), &with_header("can", 100));
+    assert_eq!(robot.unknown(20_000), []);
 }
 
 #[test]

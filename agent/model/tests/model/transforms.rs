@@ -7,6 +7,7 @@ use ros2probe_model::facts::robot::TransformFaultKind::{
     self, Apart, Jumps, SeveralBroadcasters, Silent, TimeWentBack,
 };
 use ros2probe_model::facts::robot::TransformJump;
+use ros2probe_model::observe::input::Input;
 use ros2probe_model::observe::observer::Settings;
 use ros2probe_model::report::snapshot::{EdgeFacts, TreeFacts};
 use ros2probe_testing::model::domain::VirtualDomain;
@@ -152,6 +153,26 @@ fn static_and_moving_transforms_of_each_namespace_are_separate() {
 }
 
 #[test]
+fn transforms_on_other_topics_do_not_belong_to_the_robot() {
+    let mut robot = Robot::with(Settings::default(), ["rt/tf", "rt/tf_old"]);
+    for _ in 0..100 {
+        robot.broadcast(FIRST, "odom", "base_link", 1.0);
+        let old = Transform {
+            parent: "odom",
+            child: "base_link",
+            stamp: robot.now,
+            x: 50.0,
+            yaw: 0.0,
+        };
+        robot.send(SECOND, &[old]);
+        robot.wait(100);
+    }
+    assert_eq!((robot.faults(), robot.jumps()), (vec![], vec![]));
+    assert_eq!(robot.trees().len(), 1);
+    assert_eq!(robot.edge("base_link").count, 100);
+}
+
+#[test]
 fn a_silent_broadcaster_is_a_fault_and_a_removed_broadcaster_is_not() {
     let mut robot = Robot::new();
     robot.broadcast_for(FIRST, 5);
@@ -167,6 +188,31 @@ fn a_silent_broadcaster_is_a_fault_and_a_removed_broadcaster_is_not() {
     robot.domain.put(gone);
     robot.wait(1000);
     assert_eq!((robot.faults(), robot.trees().len()), (vec![], 0));
+}
+
+#[test]
+fn an_edge_of_which_polling_sees_few_transforms_is_not_silent() {
+    let mut robot = Robot::new();
+    for number in 1..=300 {
+        let transform = Transform {
+            parent: "odom",
+            child: "base_link",
+            stamp: robot.now + 1000,
+            x: 1.0,
+            yaw: 0.0,
+        };
+        let message = Message::from(FIRST.prefix);
+        let message = message.data(FIRST.entity, number, &transforms(&[transform]));
+        match number {
+            ..=50 => robot.domain.put_exact(message),
+            51 => robot.domain.observer.input(Input::ProbesDetached),
+            _ if number % 90 == 0 => robot.domain.put_polled(message),
+            _ => {}
+        }
+        robot.wait(100);
+        assert_eq!(robot.faults(), [], "{number}");
+    }
+    assert_eq!(robot.edge("base_link").count, 53);
 }
 
 #[test]

@@ -3,10 +3,11 @@
 use std::sync::Arc;
 
 use ros2probe_model::facts::watch::{Watch, Watchlist};
-use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::input::{Captured, Input};
 use ros2probe_model::observe::observer::{Observer, Settings};
 use ros2probe_model::report::snapshot::Snapshot;
-use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::record::flag;
+use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp, walk};
 
 use super::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use super::host::{MILLISECOND, START};
@@ -44,6 +45,28 @@ impl VirtualDomain {
             payload: &message.bytes(),
             handover: None,
         });
+    }
+
+    /// Passes a message that polling saw in shared memory.
+    pub fn put_polled(&mut self, message: Message) {
+        self.observer.input(Input::SharedMemory {
+            envelope: &forge::multicast(self.now, self.domain_id),
+            payload: &message.bytes(),
+        });
+    }
+
+    /// Passes a message that a probe saw on its way to shared memory.
+    pub fn put_exact(&mut self, message: Message) {
+        let (envelope, bytes) = (forge::multicast(self.now, self.domain_id), message.bytes());
+        let captured = Captured::new(&envelope, &bytes, false);
+        let outcome = walk::datagram(&bytes, &envelope, None, |mut found| {
+            found.record.flags |= flag::SHM | flag::EXACT;
+            self.observer.input(Input::Submessage {
+                captured,
+                found: &found,
+            });
+        });
+        self.observer.input(Input::DatagramEnd(outcome));
     }
 
     pub fn wait(&mut self, milliseconds: u64) {

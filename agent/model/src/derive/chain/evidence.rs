@@ -132,6 +132,15 @@ impl Evidence {
         }
     }
 
+    /// Drops the evidence about topics that no longer exist.
+    pub(super) fn retain(&mut self, exists: impl Fn(TopicId) -> bool) {
+        self.outputs.retain(|_, counts| exists(counts.topic));
+        self.latest.retain(|topic, _| exists(*topic));
+        for counts in self.outputs.values_mut() {
+            counts.inputs.retain(|topic, _| exists(*topic));
+        }
+    }
+
     /// Evaluates the messages with one stamp. Returns the paths along accepted hops.
     pub(super) fn conclude(&mut self, mut group: Group, tracer: &mut ChainTracer) -> Vec<Trace> {
         group
@@ -222,6 +231,19 @@ impl Evidence {
 }
 
 impl Counts {
+    fn new(topic: TopicId) -> Self {
+        Self {
+            topic,
+            outputs: 0,
+            matched: 0,
+            rounded: 0,
+            own: 0,
+            aged: 0,
+            fresh: 0,
+            inputs: Bounded::default(),
+        }
+    }
+
     fn input(&mut self, topic: TopicId, name: &TopicName) -> Option<&mut InputCounts> {
         self.inputs.get_or_insert_with(topic, || InputCounts {
             name: name.clone(),
@@ -364,16 +386,12 @@ fn counts<'a>(
     if output.node.inputs.is_empty() {
         return None;
     }
-    outputs.get_or_insert_with(key, || Counts {
-        topic: output.topic,
-        outputs: 0,
-        matched: 0,
-        rounded: 0,
-        own: 0,
-        aged: 0,
-        fresh: 0,
-        inputs: Bounded::default(),
-    })
+    let counts = outputs.get_or_insert_with(key, || Counts::new(output.topic))?;
+    if counts.topic != output.topic {
+        // The topic vanished and came back, as when a robot is switched off for a while.
+        *counts = Counts::new(output.topic);
+    }
+    Some(counts)
 }
 
 /// Returns the paths of messages that no accepted hop continues. `exported` has the trace of each

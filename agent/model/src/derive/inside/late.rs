@@ -101,6 +101,13 @@ impl LateCalls {
         has_changed
     }
 
+    /// Ends all findings: there will be no reports for a while.
+    pub(super) fn end_findings(&mut self) {
+        for lateness in self.callbacks.values_mut() {
+            (lateness.alarm, lateness.alarm_cause) = (Alarm::default(), None);
+        }
+    }
+
     /// Returns the present findings.
     pub(super) fn findings(&self, at: ModelTime) -> impl Iterator<Item = Late<'_>> {
         let raised = self.callbacks.values().filter_map(|lateness| {

@@ -49,7 +49,8 @@ pub struct Inside {
     participants: HashSet<GuidPrefix>,
     /// Late calls of callbacks.
     late: LateCalls,
-    /// Last state of each managed node, by process and node.
+    /// Last state of each managed node, by process and node. It is kept while there is no report,
+    /// because the next report has the transitions of that time.
     states: Bounded<LifecycleStates, BTreeMap<(u32, Option<NodeName>), LifecycleState>>,
     /// Revisions of the graph that determined nodes and domains.
     graph: Option<(u64, u64)>,
@@ -99,6 +100,8 @@ impl Inside {
     }
 
     /// Processes a report, whose times are wall times. Returns its transitions of managed nodes.
+    /// Those of the first report happened before it, while the nodes' own messages showed them, and
+    /// are not returned.
     pub fn report(
         &mut self,
         report: Report,
@@ -115,7 +118,7 @@ impl Inside {
         } = report;
         let at = clock.model_time(at);
         let began = self.at.filter(|before| *before < at);
-        self.at = Some(at);
+        let is_first = self.at.replace(at).is_none();
         self.has_callbacks = has_callbacks;
         if began.is_none() {
             // Processes that ended while there was no report are not reported again.
@@ -136,7 +139,10 @@ impl Inside {
             self.note_late(call, clock);
         }
         let transitions = transitions.into_iter();
-        let transitions = transitions.map(|each| self.transit(each, clock)).collect();
+        let mut transitions: Vec<_> = transitions.map(|each| self.transit(each, clock)).collect();
+        if is_first {
+            transitions.clear();
+        }
         for id in ended {
             self.remove(id);
         }
@@ -162,6 +168,7 @@ impl Inside {
         self.processes.clear();
         self.participants.clear();
         self.topics.end();
+        self.late.end_findings();
     }
 
     /// Returns a number that increases with every change of [`Self::findings`].
@@ -194,11 +201,13 @@ impl Inside {
         found
     }
 
-    /// Returns whether calls have shown the lifecycle state of this node.
+    /// Returns whether calls show the lifecycle state of this node at present.
     #[must_use]
     pub fn knows_state(&self, domain_id: DomainId, node: &NodeName) -> bool {
-        let mut states = self.states.values();
-        states.any(|state| state.domain_id == domain_id && state.node.as_ref() == Some(node))
+        let is_this = |state: &LifecycleState| {
+            state.domain_id == domain_id && state.node.as_ref() == Some(node)
+        };
+        self.at.is_some() && self.states.values().any(is_this)
     }
 
     /// Returns whether this participant's process is observed.

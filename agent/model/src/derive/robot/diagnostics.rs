@@ -182,11 +182,11 @@ impl Diagnostics {
     }
 
     /// Ends a second: parts whose messages ceased become stale, and faults that last are reported.
-    /// `is_paused` says whether a writer is not captured now.
+    /// `is_unseen` returns whether messages of a writer may pass unseen.
     pub(super) fn end_second(
         &mut self,
         now: ModelTime,
-        is_paused: impl Fn(Guid) -> bool,
+        is_unseen: impl Fn(Guid) -> bool,
         events: &mut Events,
     ) {
         for part in self.parts.values_mut() {
@@ -197,7 +197,7 @@ impl Diagnostics {
             let status = &part.status;
             if status.level != DiagnosticLevel::Stale
                 && now - status.at > silence
-                && !is_paused(status.writer)
+                && !is_unseen(status.writer)
             {
                 let before = status.level;
                 part.status = Arc::new(DiagnosticStatus {

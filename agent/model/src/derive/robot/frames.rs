@@ -39,15 +39,25 @@ struct FrameWriter {
 }
 
 impl Frames {
-    /// Begins to wait for a message of this writer, unless the table is full.
-    pub(super) fn follow(&mut self, writer: Guid, domain_id: DomainId, topic: &TopicName) {
+    /// Begins to wait for a message of this writer. Returns whether the table has room for it.
+    pub(super) fn follow(&mut self, writer: Guid, domain_id: DomainId, topic: &TopicName) -> bool {
         let new = || FrameWriter {
             domain_id,
             topic: topic.clone(),
             frame: None,
             unknown: None,
         };
-        self.writers.get_or_insert_with(writer, new);
+        self.writers.get_or_insert_with(writer, new).is_some()
+    }
+
+    /// Returns whether the writer is followed.
+    pub(super) fn knows(&self, writer: Guid) -> bool {
+        self.writers.contains_key(&writer)
+    }
+
+    /// Returns whether the table is full.
+    pub(super) fn is_full(&self) -> bool {
+        self.writers.is_full()
     }
 
     /// Removes a departed writer.

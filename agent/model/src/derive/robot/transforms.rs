@@ -142,6 +142,14 @@ impl Transforms {
         Ok(())
     }
 
+    /// Removes a departed writer of which no message was read.
+    pub(super) fn forget_unread(&mut self, writer: Guid) {
+        let known = self.broadcasters.get(&writer);
+        if known.is_some_and(|known| !known.is_received) {
+            self.broadcasters.remove(&writer);
+        }
+    }
+
     /// Removes what a departed writer broadcast.
     pub(super) fn forget(&mut self, writer: Guid) {
         self.broadcasters.remove(&writer);
@@ -154,8 +162,9 @@ impl Transforms {
         self.revision += 1;
     }
 
-    /// Ends a second: rates, and the faults that last.
-    pub(super) fn end_second(&mut self, now: ModelTime, is_paused: impl Fn(Guid) -> bool) {
+    /// Ends a second: rates, and the faults that last. `is_unseen` returns whether messages of a
+    /// writer may pass unseen.
+    pub(super) fn end_second(&mut self, now: ModelTime, is_unseen: impl Fn(Guid) -> bool) {
         for tree in self.trees.iter_mut() {
             let of_tree = |each: &StaticBroadcaster| {
                 (each.domain_id, &each.namespace) == (tree.domain_id, &tree.namespace)
@@ -163,7 +172,7 @@ impl Transforms {
             let mut static_broadcasters = self.broadcasters.values();
             // Without all static transforms, a tree only seems to be in parts.
             let is_whole = static_broadcasters.all(|each| each.is_received || !of_tree(each));
-            if tree.end_second(now, is_whole, &is_paused) {
+            if tree.end_second(now, is_whole, &is_unseen) {
                 self.revision += 1;
             }
         }
@@ -287,12 +296,12 @@ impl Tree {
         &mut self,
         now: ModelTime,
         is_whole: bool,
-        is_paused: &impl Fn(Guid) -> bool,
+        is_unseen: &impl Fn(Guid) -> bool,
     ) -> bool {
         let mut faults: Vec<TransformFault> = Vec::new();
         for (child, edge) in &mut self.edges {
             edge.end_second();
-            if let Some(kind) = edge.fault(now, is_paused) {
+            if let Some(kind) = edge.fault(now, is_unseen) {
                 let names = edge.names();
                 // One broadcaster may have many edges.
                 let same = faults.iter_mut();
@@ -349,10 +358,16 @@ impl Tree {
     }
 }
 
+/// Returns whether transforms on a topic belong to the robot: its last token is `tf` or `tf_static`.
+pub(super) fn is_topic(topic: &str) -> bool {
+    let name = topic.rsplit('/').next();
+    matches!(name, Some("tf" | "tf_static"))
+}
+
 /// Returns the namespace of a topic of transforms, and whether it has static ones.
 fn namespace(topic: &str) -> (&str, bool) {
     let (namespace, name) = topic.rsplit_once('/').unwrap_or(("", topic));
-    (namespace, name.ends_with("_static"))
+    (namespace, name == "tf_static")
 }
 
 /// Returns a frame without the leading slash of older names, which tf2 ignores.

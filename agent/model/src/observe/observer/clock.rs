@@ -20,8 +20,12 @@ use crate::facts::rate::Slot;
 use crate::facts::route::Receiver;
 use crate::facts::watch::WatchState;
 use crate::measure::expectation::Evidence;
+use crate::measure::receivers::Graph;
 use crate::measure::sampled::Sampled;
 use crate::report::transport::is_polled;
+
+/// Number of a topic's readers that are examined for each writer that seems silent.
+const EXAMINED_READERS: usize = 64;
 
 impl Observer {
     /// Advances the time: expires leases, settles gaps, evaluates expectations.
@@ -157,7 +161,10 @@ impl Observer {
                 self.apply_lists_to_latched(writer, now);
             }
             self.end_second_of_clocks(now);
-            for writer in self.derive.robot.end_second(now, &mut self.journal.events) {
+            let graph = &self.graph;
+            let is_hidden = |writer| is_hidden(graph, writer);
+            let events = &mut self.journal.events;
+            for writer in self.derive.robot.end_second(now, is_hidden, events) {
                 self.apply_lists_to_latched(writer, now);
             }
             let profiler = &self.measure.profiler;
@@ -174,6 +181,7 @@ impl Observer {
                 .update_locality(|prefix| self.graph.receivers.is_local(prefix));
             self.settle_inside(now);
             self.assign_free_slots();
+            self.read_refused_writers(now);
             self.end_second_of_losses();
             self.judge(now);
             self.advance_calls(now);
@@ -321,6 +329,19 @@ impl Observer {
             }
         }
     }
+}
+
+/// Returns whether all messages of a writer pass through shared memory, according to its first
+/// readers.
+fn is_hidden(graph: &Graph, writer: Guid) -> bool {
+    let topic = graph.discovery.endpoints().get(&writer).and_then(|endpoint| {
+        let id = graph.topics.find(endpoint.domain_id, &endpoint.naming()?)?;
+        graph.topics.get(id)
+    });
+    topic.is_some_and(|topic| {
+        let readers = topic.readers.get(..EXAMINED_READERS);
+        is_polled(&graph.discovery, writer, readers.unwrap_or(&topic.readers))
+    })
 }
 
 #[cfg(test)]

@@ -11,7 +11,6 @@ use ros2probe_wire::{Guid, RtpsDuration, SequenceNumber};
 use super::MAX_MATCHES_PER_ROUND;
 use super::Observer;
 use super::references::Reference;
-use crate::derive::robot::Part;
 use crate::derive::trace::share::Share;
 use crate::facts::dispatch::{self, Offered};
 use crate::facts::header::begins_with_header;
@@ -198,16 +197,8 @@ impl Observer {
                 let latched = self.measure.latched.verdict(guid);
                 let (robot, parts) = (&mut self.derive.robot, self.settings.robot);
                 let (domain_id, name) = (topic.domain_id, &topic.naming.name);
-                match robot.standard(name, &endpoint.message_type) {
-                    Some(standard) if counts && parts.has(standard.part()) => {
-                        robot.follow(guid, (domain_id, name), standard);
-                    }
-                    None if counts
-                        && parts.has(Part::Transforms)
-                        && begins_with_header(&endpoint.message_type) =>
-                    {
-                        robot.follow_frame(guid, domain_id, name);
-                    }
+                match robot.reading(name, &endpoint.message_type, parts) {
+                    Some(reading) if counts => robot.follow(guid, (domain_id, name), reading),
                     _ => robot.forget(guid),
                 }
                 let is_read = self.derive.robot.is_captured(guid);
@@ -258,6 +249,35 @@ impl Observer {
         });
         if let Some(id) = id {
             self.apply(id, writer, now, false);
+        }
+    }
+
+    /// Reads the writers of standard types that were refused while their table was full, as far as
+    /// there is room now.
+    pub(super) fn read_refused_writers(&mut self, now: ModelTime) {
+        if !self.derive.robot.may_retry() {
+            return;
+        }
+        self.derive.robot.retry();
+        let (robot, parts) = (&self.derive.robot, self.settings.robot);
+        let endpoints = self.graph.discovery.endpoints();
+        let mut candidates = Vec::new();
+        for (id, topic) in self.graph.topics.iter() {
+            for guid in topic.writers.iter().chain(&topic.buffer_endpoints) {
+                let endpoint = endpoints.get(guid).filter(|endpoint| {
+                    let naming = endpoint.naming();
+                    endpoint.role == Role::Writer && naming.is_some_and(|naming| naming.counts)
+                });
+                let reading = endpoint.and_then(|endpoint| {
+                    robot.reading(&topic.naming.name, &endpoint.message_type, parts)
+                });
+                candidates.extend(reading.map(|reading| (id, *guid, reading)));
+            }
+        }
+        for (id, guid, reading) in candidates {
+            if self.derive.robot.has_place_for(guid, reading) {
+                self.apply(id, guid, now, false);
+            }
         }
     }
 

@@ -30,6 +30,8 @@ pub struct Robot {
     pub observer: Observer,
     now: u64,
     nodes: Vec<(String, Vec<String>, Vec<String>)>,
+    /// Number of participants so far.
+    participants: u16,
     /// Writers and numbers of their last messages, by topic.
     writers: BTreeMap<String, (Guid, u64)>,
     /// Time, topic and stamp.
@@ -65,6 +67,7 @@ impl Robot {
             observer,
             now: START,
             nodes: Vec::new(),
+            participants: 0,
             writers: BTreeMap::new(),
             planned: Vec::new(),
         }
@@ -81,12 +84,11 @@ impl Robot {
         self.observer.input(Input::ExpectedChains(Arc::new(chains)));
     }
 
-    /// Announces all nodes.
+    /// Announces all nodes, each in a new participant.
     pub fn start(&mut self) {
-        for (index, (name, inputs, outputs)) in self.nodes.clone().iter().enumerate() {
-            let mut bytes = *b"\x01\x10chain-node";
-            bytes[10..].copy_from_slice(&u16::try_from(index).unwrap().to_be_bytes());
-            let prefix = GuidPrefix(bytes);
+        for (name, inputs, outputs) in &self.nodes.clone() {
+            let prefix = participant(self.participants);
+            self.participants += 1;
             let payload = forge::participant(prefix, 1_000_000, None);
             self.put(Message::from(prefix).data(SPDP, 1, &payload));
             let mut endpoints = |topics: &[String], kind: u8, sedp| {
@@ -118,6 +120,20 @@ impl Robot {
             self.put(Message::from(prefix).data(NODES, 1, &payload));
         }
         self.wait(2 * SECOND);
+    }
+
+    /// Disposes of all participants.
+    pub fn stop(&mut self) {
+        for number in 0..self.participants {
+            let prefix = participant(number);
+            let guid = Guid::new(prefix, EntityId::PARTICIPANT);
+            self.put(Message::from(prefix).dispose_by_hash(SPDP, 2, guid));
+        }
+    }
+
+    /// Returns the time since the start.
+    pub fn elapsed(&self) -> u64 {
+        self.now - START
     }
 
     /// Returns a time after the start.
@@ -204,6 +220,12 @@ impl Robot {
             handover: None,
         });
     }
+}
+
+fn participant(number: u16) -> GuidPrefix {
+    let mut bytes = *b"\x01\x10chain-node";
+    bytes[10..].copy_from_slice(&number.to_be_bytes());
+    GuidPrefix(bytes)
 }
 
 /// Returns the chain as text.

@@ -12,8 +12,14 @@ fn robot(every: u64, stamp: impl Fn(u64, u64) -> u64) -> Robot {
     robot.node("/filter", &["/points", "/plain"], &["/filtered"]);
     robot.node("/controller", &["/filtered"], &["/cmd"]);
     robot.start();
+    play(&mut robot, every, stamp);
+    robot
+}
+
+fn play(robot: &mut Robot, every: u64, stamp: impl Fn(u64, u64) -> u64) {
+    let begin = robot.elapsed();
     for index in 0..300 {
-        let at = robot.after(index * 50 * MILLISECOND + 77 * index);
+        let at = robot.after(begin + index * 50 * MILLISECOND + 77 * index);
         robot.publish("/points", at, at - MILLISECOND);
         if index % every == 0 {
             let out = at + 12 * MILLISECOND;
@@ -24,7 +30,6 @@ fn robot(every: u64, stamp: impl Fn(u64, u64) -> u64) -> Robot {
     }
     robot.play_only();
     robot.wait(3_000 * MILLISECOND);
-    robot
 }
 
 #[test]
@@ -39,6 +44,19 @@ fn a_restamping_node_is_a_finding_and_ends_the_chain() {
         ("/filtered", "/filter", "/points")
     );
     assert_eq!(robot.shown(), ["/filtered -[/controller]-> /cmd"]);
+}
+
+#[test]
+fn a_restamping_node_is_found_again_after_the_robot_was_off() {
+    let stamp = |_, out: u64| out - 50 * MICROSECOND;
+    let mut robot = robot(1, stamp);
+    assert_eq!(robot.findings().len(), 1);
+    robot.stop();
+    robot.wait(601_000 * MILLISECOND);
+    assert_eq!(robot.findings(), []);
+    robot.start();
+    play(&mut robot, 1, stamp);
+    assert_eq!(robot.findings().len(), 1);
 }
 
 #[test]

@@ -569,6 +569,22 @@ fn three_late_calls_in_a_minute_are_a_finding_with_the_cause_until_the_minute_is
 }
 
 #[test]
+fn a_finding_does_not_return_with_the_next_client() {
+    let mut observer = Observer::new(Settings::default());
+    for second in 0..10 {
+        report(&mut observer, second, u32::from(second < 3));
+    }
+    assert_eq!(late_findings(&mut observer, 9).len(), 1);
+    observer.input(Input::InsideDetached);
+    observer.input(Input::Time(Timestamp(START + 3600 * SECOND)));
+    assert_eq!(late_findings(&mut observer, 3600), []);
+    report(&mut observer, 3601, 0);
+    assert_eq!(late_findings(&mut observer, 3601), []);
+    let facts = observer.snapshot(Timestamp(START + 3601 * SECOND)).inside;
+    assert_eq!(facts.unwrap().late[0].calls, 3, "the calls are kept");
+}
+
+#[test]
 fn a_finding_keeps_its_cause_and_calls_while_calls_with_another_cause_follow() {
     let mut observer = Observer::new(Settings::default());
     let facts = |observer: &mut Observer, second| {

@@ -1,6 +1,7 @@
 //! Sums per topic, rates, nodes and domains.
 
 use ros2probe_model::facts::event::EventKind;
+use ros2probe_testing::robot_states;
 
 use super::*;
 
@@ -253,6 +254,52 @@ fn callbacks_and_transitions_belong_to_the_only_node_of_a_process() {
             (&lidar, "active", "inactive")
         ]
     );
+}
+
+#[test]
+fn a_transition_between_two_observations_is_one_event() {
+    let mut world = World::new();
+    let prefix = world.participant(1, 70);
+    let events = Guid::new(prefix, EntityId([0, 0, 0x11, 3]));
+    world.announce(events, "rt/lidar/transition_event", robot_states::TRANSITION);
+    let lidar = ProcessReport {
+        nodes: vec!["/lidar".into()],
+        ..process(70)
+    };
+    let transition = |start: &str, goal: &str, at: u64| Transition {
+        process: 70,
+        node: node("/lidar"),
+        start: start.into(),
+        goal: goal.into(),
+        at: Timestamp(at),
+    };
+    let transitions = |world: &mut World| {
+        let events = world.observer.drain().events.events;
+        let transitions = events.into_iter().filter_map(|event| match event.kind {
+            EventKind::Lifecycle { process, to, .. } => Some((process, to.to_string())),
+            _ => None,
+        });
+        transitions.collect::<Vec<_>>()
+    };
+    world.second(vec![lidar]);
+    world.transit(transition("configuring", "inactive", world.now));
+    let inside = |goal: &str| (Some(70), goal.to_owned());
+    assert_eq!(transitions(&mut world), [inside("inactive")]);
+
+    world.observer.input(Input::InsideDetached);
+    let payload = robot_states::transition(13, 3);
+    world.put(Message::from_fast(prefix).data(events.entity, 1, &payload));
+    let at = world.now;
+    assert_eq!(transitions(&mut world), [(None, "active".to_owned())]);
+    world.now += 3600 * SECOND;
+    world.observer.input(Input::Time(Timestamp(world.now)));
+    world.transit(transition("activating", "active", at));
+    assert_eq!(transitions(&mut world), []);
+    let facts = world.snapshot().inside.unwrap();
+    assert_eq!(&*facts.states[0].state, "active");
+    world.now += SECOND;
+    world.transit(transition("deactivating", "inactive", world.now));
+    assert_eq!(transitions(&mut world), [inside("inactive")]);
 }
 
 #[test]

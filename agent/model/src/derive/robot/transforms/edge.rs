@@ -258,7 +258,7 @@ impl Edge {
     pub(super) fn fault(
         &self,
         now: ModelTime,
-        is_paused: &impl Fn(Guid) -> bool,
+        is_unseen: &impl Fn(Guid) -> bool,
     ) -> Option<TransformFaultKind> {
         let last = self.last.as_ref()?;
         if self.has_several(last, now) {
@@ -277,7 +277,7 @@ impl Edge {
         let limit = SILENCE.max(self.interval? * SILENT_INTERVALS);
         let mut writers = self.broadcasters.iter();
         let is_silent =
-            !last.is_static && now - last.at > limit && !writers.any(|each| is_paused(each.writer));
+            !last.is_static && now - last.at > limit && !writers.any(|each| is_unseen(each.writer));
         is_silent.then_some(TransformFaultKind::Silent)
     }
 
