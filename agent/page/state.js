@@ -83,12 +83,18 @@ export class State {
   /** @type {string|null} */ ended = null;
   /** Complete batches of this run of the agent. */
   batches = 0;
+  /** Number of streams that were opened. Events between two streams are not in either. */
+  openings = 0;
   /** Whether this is the state of a moment in the past. */
   past = false;
+  /** Whether nothing is known of that moment. */
+  unknown = false;
 
   /** Resets the state for another run of the agent. */
   clear() {
-    Object.assign(this, new State(), { structure: this.structure + 1, scripts: this.scripts });
+    Object.assign(this, new State(), {
+      structure: this.structure + 1, scripts: this.scripts, openings: this.openings,
+    });
   }
 
   /**
@@ -115,8 +121,16 @@ export class State {
     this.past = true;
   }
 
+  /** Replaces the state by an empty one, of a moment in the past of which nothing is known. @param {number} at */
+  showUnknown(at) {
+    const { open } = this;
+    this.clear();
+    Object.assign(this, { open, time: at, batches: 1, past: true, unknown: true });
+  }
+
   /** @param {any} open */
   takeOpen(open) {
+    this.openings += 1;
     if (!this.open || this.open.run !== open.run || this.past) this.clear();
     this.open = open;
     this.ended = null;

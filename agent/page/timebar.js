@@ -86,7 +86,8 @@ async function lines(path, options) {
  * @returns {import('./state.js').Event[]}
  */
 export function useEvents(shown) {
-  const { data } = useHistory(state.open?.keeps_history ? 'history/events' : null, shown, lines);
+  const isKept = state.open ? state.open.keeps_history : shown.at != null;
+  const { data } = useHistory(isKept ? 'history/events' : null, shown, lines);
   const to = shown.at ?? state.time;
   const all = new Map([...(data ?? []), ...(shown.at == null ? state.events : [])]
     .map((event) => [event.id, event]));

@@ -9,6 +9,7 @@ const MOST_SHOWN = 50;
 
 export function Overview() {
   useLive();
+  if (state.unknown) return html`<h1 tabindex="-1">Overview</h1><p>What was wrong at that time is not known.</p>`;
   const unseen = state.findings.filter((finding) => finding.kind === 'ability');
   const findings = state.findings.filter((finding) => finding.kind !== 'ability');
   const serious = findings.filter((finding) => finding.severity !== 'note');

@@ -37,8 +37,10 @@ export function Topic({ name, query }) {
   if (!topic) {
     return html`<h1 tabindex="-1"><${Name} text=${name} /></h1>
       <p>No such topic ${stream.at == null ? 'now. It may have had no endpoint since the agent started'
-        : 'at that time'}.${' '}
-      <a href=${address('topics')}>All topics</a></p>`;
+        : state.unknown ? 'is known of that time' : 'at that time'}.${' '}
+      <a href=${address('topics')}>All topics</a></p>
+      ${state.unknown && html`<${Charts} topic=${{ id: 0, name, ddsName: name, kind: 'topic', measured: true }}
+        scope=${scope} events=${eventsOf(known, name)} pick=${() => {}} />`}`;
   }
   const events = eventsOf(known, topic.name);
   const figures = state.figuresOf(topic.id);

@@ -59,6 +59,24 @@ await scenario(async (open) => {
   await page.goto(`${page.url().split('#')[0]}#/topics?at=1000000`);
   await reads(page.locator('.notice'), 'The robot’s state at that time is unknown');
   tab.expect(/^error: Failed to load resource.*404/);
+  // No other time is shown in its place.
+  await gone(page.locator('main tbody tr[data-row]'));
+  await page.goto(`${page.url().split('#')[0]}#/?at=1000000`);
+  await reads(page.locator('main'), 'not known');
+  assert.doesNotMatch(await tab.text(), /Nothing is broken/);
+  // A bookmark of it is not stuck, and one of a moment that is lost on the way is read again.
+  await page.goto('about:blank');
+  await page.goto(`${tab.address}#/topics?at=1000000`);
+  await reads(page.locator('.notice'), 'The robot’s state at that time is unknown');
+  await tab.accessible('a time without an agent');
+  tab.expect(/^error: Failed to load resource: net::ERR_/);
+  await page.route('**/history/moment*', (route) => route.abort());
+  await page.goto(`${page.url().split('#')[0]}#/topics?at=${end}`);
+  await reads(page.locator('.notice'), 'Trying again');
+  await gone(page.locator('main tbody tr[data-row]'));
+  await page.unroute('**/history/moment*');
+  await reads(page.locator('.notice'), 'The robot as it was');
+  await row('/imu').waitFor();
 
   await page.getByRole('button', { name: 'Now' }).click();
   await tab.live();
