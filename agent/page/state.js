@@ -174,20 +174,19 @@ export class State {
   /** Takes the scripts that interpreters run. @param {any[]} processes as `GET /processes` has them */
   takeProcesses(processes) {
     const before = JSON.stringify([...this.scripts]);
-    for (const { process_id: pid, process, script } of processes) {
-      if (script) this.scripts.set(pid, { process, script });
-      else this.scripts.delete(pid);
-    }
+    this.scripts = new Map(processes.filter(({ script }) => script).map(({ process_id: pid, process, script }) =>
+      [pid, { process, script }]));
     if (JSON.stringify([...this.scripts]) !== before) this.structure += 1;
   }
 
   /**
    * Returns script or program of a process with its id: "robot.py 4711"; empty if it is unknown.
-   * @param {{pid: number|null, process: string|null}|null|undefined} process
+   * @param {{pid: number|null, process: string|null, cgroup?: string|null}|null|undefined} process a
+   *   participant without a control group is on another host
    */
   processName(process) {
     const name = [process?.process, process?.pid].filter((part) => part != null).join(' ');
-    return this.withScripts(name);
+    return process?.cgroup === null ? name : this.withScripts(name);
   }
 
   /** Returns a text with the scripts of the processes that it names. @param {string} text */

@@ -164,9 +164,11 @@ test('lines are cut anywhere', () => {
 test('processes have the name of their script, in texts of the agent too', () => {
   const state = ready();
   const { structure } = state;
+  const local = [...GRAPH.participants[0].slice(0, 7), '/robot.slice'];
+  feed(state, { graph: { ...GRAPH, participants: [local] } });
   state.takeProcesses([{ process_id: 4711, process: 'driver', script: 'lidar.py' },
     { process_id: 12, process: 'rviz2', script: null }]);
-  assert.equal(state.structure, structure + 1);
+  assert.equal(state.structure, structure + 2);
   const participant = state.participants.get(1);
   assert.equal(state.processName(participant), 'lidar.py 4711');
   assert.equal(state.processName({ pid: 12, process: 'rviz2' }), 'rviz2 12');
@@ -180,4 +182,8 @@ test('processes have the name of their script, in texts of the agent too', () =>
   const again = state.structure;
   state.takeProcesses([]);
   assert.equal(state.structure, again);
+  // A process that has ended.
+  state.takeProcesses([{ process_id: 4711, process: 'driver', script: 'lidar.py' }]);
+  state.takeProcesses([{ process_id: 12, process: 'rviz2', script: null }]);
+  assert.equal(state.processName({ pid: 4711, process: 'driver' }), 'driver 4711');
 });
