@@ -100,6 +100,18 @@ test('another run of the agent forgets everything, the same one keeps events', (
   assert.equal(state.batches, 0);
 });
 
+test('each stream is counted, because events between two streams are in neither', () => {
+  const state = ready();
+  assert.equal(state.openings, 1);
+  feed(state, { open: OPEN });
+  assert.equal(state.openings, 2);
+  state.showUnknown(5);
+  feed(state, { open: OPEN });
+  state.show([{ open: { ...OPEN, run: 'r0' } }]);
+  feed(state, { open: { ...OPEN, run: 'r2' } });
+  assert.equal(state.openings, 5);
+});
+
 test('history comes first, steps are appended, and ten minutes are kept', () => {
   const state = ready();
   feed(state, { history: {

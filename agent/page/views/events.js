@@ -104,10 +104,13 @@ export function namesOf(events, known) {
   };
 }
 
-/** Requests the events that the agent keeps, once a run, and returns why they are missing. */
+/**
+ * Requests the events that the agent keeps, once for each stream: a stream has no events from before it
+ * was opened. Returns why they are missing.
+ */
 export function useEarlier() {
   const [failed, fail] = useState('');
-  const run = state.open?.run;
+  const { openings } = state;
   useEffect(() => {
     const abort = new AbortController();
     request('events?after=0&follow=false', { signal: abort.signal })
@@ -118,7 +121,7 @@ export function useEarlier() {
       })
       .catch((error) => { if (!abort.signal.aborted) fail(error.message); });
     return () => abort.abort();
-  }, [run]);
+  }, [openings]);
   return failed;
 }
 

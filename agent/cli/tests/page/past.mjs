@@ -83,6 +83,14 @@ await scenario(async (open) => {
   await row('/after_restart').waitFor();
   await gone(page.locator('.notice'));
 
+  // The present has its events again after the past.
+  await page.getByRole('navigation').getByRole('link', { name: 'Events' }).click();
+  await reads(page.locator('main'), '/other');
+  await page.getByRole('button', { name: 'Earlier' }).click();
+  await page.getByRole('button', { name: 'Now' }).click();
+  await tab.live();
+  await reads(page.locator('main'), /node appeared[^]*\/other/);
+
   // The graph compared with a moment before the restart.
   await page.goto(`${page.url().split('#')[0]}#/graph?against=3`);
   const differences = page.getByRole('region', { name: 'Differences' });
