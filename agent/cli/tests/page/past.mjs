@@ -21,6 +21,8 @@ await scenario(async (open) => {
   const chart = row('/imu').locator('.spark path');
   await until('its small chart', async () => /L/.test(await chart.getAttribute('d')));
   await tab.accessible('the past');
+  // No switch of the past changes what is measured now.
+  assert.equal(await page.locator('main button.switch:enabled').count(), 0);
 
   // Its links keep the time.
   await row('/imu').getByRole('link', { name: '/imu' }).click();
