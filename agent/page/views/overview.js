@@ -87,9 +87,9 @@ export function grouped(list) {
 function now(finding) {
   if (finding.topic == null) return '';
   const figures = state.figuresOf(finding.topic);
-  const { lost, messages } = figures;
-  if (finding.kind === 'loss' && lost != null && lost > 0) {
-    return `, ${percent(lost / (lost + (messages ?? 0)))} since it is measured`;
+  const { lost, expected } = figures;
+  if (finding.kind === 'loss' && lost != null && lost > 0 && expected) {
+    return `, ${percent(lost / expected)} since it is measured`;
   }
   if (finding.kind === 'watch_violated' && figures.rate != null) {
     const latency = /latency/.test(finding.text) && figures.p99 != null
