@@ -4,7 +4,7 @@
 import { useEffect, useRef, useState } from './vendor/hooks.mjs';
 import { named, Refusal, request } from './api.js';
 import { Chart } from './chart.js';
-import { bytes, clock, count, visible } from './format.js';
+import { bytes, count, visible, when } from './format.js';
 import { Preview } from './preview.js';
 import { Lines } from './state.js';
 import { state, stream, useKept } from './store.js';
@@ -231,7 +231,7 @@ function Follow({ scope, name, topic, events }) {
     ${plots.length > 0 && html`<div class="charts">${plots.map((lines) => html`<${Chart}
       key=${lines[0].label} title=${lines.map(({ label }) => label).join(', ')} times=${times}
       print=${printNumber} fitted marks=${marks} range="the last messages" lines=${lines} />`)}</div>`}
-    ${message && html`<p class="dim">${clock(message.time)}, ${bytes(message.bytes)}${
+    ${message && html`<p class="dim">${when(message.time)}, ${bytes(message.bytes)}${
       message.sequence_number != null ? `, number ${count(message.sequence_number)}` : ''}${
       message.node ? html` by <${Name} text=${message.node} />` : ''}${message.skipped
       ? `, ${count(message.skipped)} not shown before it` : ''}</p>`}

@@ -2,7 +2,7 @@
 
 import { useEffect, useState } from '../vendor/hooks.mjs';
 import { request } from '../api.js';
-import { clock, count, date, eventWords, several, visible } from '../format.js';
+import { count, date, eventWords, several, visible, when } from '../format.js';
 import { address } from '../router.js';
 import { replaceAddress, state, useLive } from '../store.js';
 import { inWords, useEvents, useTime } from '../timebar.js';
@@ -163,7 +163,7 @@ export function Events({ query }) {
     ${rows.length ? html`<div class="scroll tall" tabindex="0" role="group" aria-label="Events"><table>
       <thead><tr><th scope="col">Time</th><th scope="col">Event</th><th scope="col">What</th></tr></thead>
       <tbody>${rows.slice(0, MOST_SHOWN).map((/** @type {any} */ event) => html`<tr key=${event.id}>
-        <td class="number"><time datetime=${event.time} title=${event.time}>${(isPast ? date : clock)(
+        <td class="number"><time datetime=${event.time} title=${event.time}>${(isPast ? date : when)(
           Date.parse(event.time) / 1000)}</time></td>
         <th scope="row"><${Mark} severity=${SEVERITY[event.severity] ?? 'note'} /> ${eventWords(event)}</th>
         <td><${Attributes} event=${event} names=${names} /></td></tr>`)}</tbody></table></div>

@@ -1,6 +1,6 @@
 // Findings with their age and remedy, then totals, then the agent's blind spots.
 
-import { age, bandwidth, clock, count, duration, percent, rate, several } from '../format.js';
+import { age, bandwidth, count, duration, percent, rate, several, when } from '../format.js';
 import { address, findingAddress } from '../router.js';
 import { state, useLive } from '../store.js';
 import { Figure, html, Mark, Name, Sentence, TopicLink, worst, Badges } from '../ui.js';
@@ -47,7 +47,7 @@ export function Findings({ list }) {
       <span><${Place} finding=${finding} /> <${Sentence} text=${rest(finding)} />${now(finding)}
       ${more.has(finding) && html`
         <span class="dim"> and ${several(more.get(finding) ?? 0, 'other')} of this topic</span>`}
-      ${finding.since != null && html` <span class="dim">since ${clock(finding.since)} (${age(state.time - finding.since)})</span>`}
+      ${finding.since != null && html` <span class="dim">since ${when(finding.since)} (${age(state.time - finding.since)})</span>`}
       ${finding.remedy && html`<br /><span class="remedy">Remedy: <${Sentence} text=${finding.remedy}
         /></span>`}</span></li>`)}</ul>
     ${firsts.length > MOST_SHOWN && html`<p class="dim">${count(firsts.length - MOST_SHOWN)} more.

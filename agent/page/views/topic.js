@@ -3,7 +3,7 @@
 import { useRef, useState } from '../vendor/hooks.mjs';
 import { named } from '../api.js';
 import { Chart } from '../chart.js';
-import { bandwidth, clock, count, date, duration, eventWords, percent, rate, several } from '../format.js';
+import { bandwidth, count, date, duration, eventWords, percent, rate, several, when } from '../format.js';
 import { address } from '../router.js';
 import { topicKey } from '../graph-model.js';
 import { LiveMessage } from '../message.js';
@@ -71,7 +71,7 @@ export function Topic({ name, query }) {
       <${Figure} label="lost" value=${count(figures.lost)} />
       <${Figure} label="latency p50" value=${duration(figures.p50)} />
       <${Figure} label="latency p99" value=${duration(figures.p99)} />
-      <${Figure} label="last message" value=${clock(figures.last)} />
+      <${Figure} label="last message" value=${when(figures.last)} />
     </div>
     <${Clocks} publishers=${details.data?.publishers ?? []} />
     <${Charts} key=${topic.id} topic=${topic} scope=${scope} events=${events} pick=${(/** @type {{time: number}} */
