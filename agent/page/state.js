@@ -3,8 +3,9 @@
 // The agent sends the whole graph when its structure changes, and only the rows whose figures
 // changed. The state is bounded: series keep ten minutes, events the latest thousand.
 
-/** Points of a sparkline. */
+/** Points of a sparkline, and the seconds of each: the last ten minutes. */
 export const STEPS = 60;
+const STEP_SECONDS = 10;
 /** Most events kept. */
 export const MOST_EVENTS = 1000;
 
@@ -79,6 +80,7 @@ export class State {
   /** Time of the source's clock. */
   time = 0;
   stepBegan = 0;
+  stepSeconds = STEP_SECONDS;
   /** @type {{part: number|null, finished: boolean, paused: boolean, speed: number}|null} */ replay = null;
   /** @type {string|null} */ ended = null;
   /** Complete batches of this run of the agent. */
@@ -233,13 +235,9 @@ export class State {
     const { rate, bandwidth, lost } = this.totals;
     [rate, bandwidth, lost].forEach((value, at) => this.totalSeries[at].add(value));
     if (!this.stepBegan) this.stepBegan = time;
-    if (time - this.stepBegan < this.stepLength()) return;
+    if (time - this.stepBegan < this.stepSeconds) return;
     this.stepBegan = time;
     for (const series of [...this.series.values(), ...this.totalSeries]) series.step();
-  }
-
-  stepLength() {
-    return (this.open?.history_seconds ?? 600) / STEPS;
   }
 
   /** @param {any} history */
@@ -255,6 +253,7 @@ export class State {
       series.points = (history.totals[at] ?? []).slice(-STEPS);
       return series;
     });
+    this.stepSeconds = history.step_seconds ?? STEP_SECONDS;
     this.stepBegan = history.t.length ? history.t[history.t.length - 1] : 0;
     this.time = this.stepBegan;
   }

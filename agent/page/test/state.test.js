@@ -127,6 +127,17 @@ test('history comes first, steps are appended, and ten minutes are kept', () => 
   assert.equal(state.totalSeries[0].points.length, STEPS);
 });
 
+test('steps have the length of the history before them, whatever the agent keeps', () => {
+  for (const history_seconds of [60, 600, 3600]) {
+    const state = new State();
+    feed(state, { open: { ...OPEN, history_seconds } }, { graph: GRAPH },
+      { history: { step_seconds: 10, t: [80, 90], totals: [[1, 2], [3, 4], [0, 0]], topics: [[1, [8, 9]]] } });
+    for (let t = 91; t <= 690; t += 1) feed(state, values(t, [[1, t, 0, 0, 0, 0, null, null, 0, t]]));
+    assert.equal(state.pointsOf(1).length, STEPS, 'ten minutes');
+    assert.deepEqual(state.pointsOf(1).slice(0, 2), [95.5, 105.5]);
+  }
+});
+
 test('events are kept once, in order, and not without end', () => {
   const state = ready();
   const event = (/** @type {number} */ number) => ({

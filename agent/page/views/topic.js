@@ -112,13 +112,13 @@ function Clocks({ publishers }) {
 function Charts({ topic, scope, events, pick }) {
   const shown = useTime();
   const path = named('topics', apiName(topic), `/history${scope}`);
-  const isLive = shown.at == null && shown.span === LIVE_SPAN;
+  const isLive = shown.at == null && shown.span === LIVE_SPAN && isInMemory();
   const latest = useLatest(isLive ? path : null, topic);
   const past = useHistory(isLive ? null : path, shown);
   const columns = isLive ? latest : COLUMNS.map((column) => past.data?.[column] ?? []);
   const marks = marksOf(events);
   const [times, rates, sizes, lost, half, most, gapHalf, gapMost] = columns;
-  const title = inWords(shown);
+  const title = inWords(isLive ? { at: null, span: liveSpan() } : shown);
   if (!times.length) {
     return html`<p class="dim">${past.problem ? `No history: ${past.problem.message}`
       : !isLive && !past.data ? 'Reading the history …'
@@ -149,6 +149,26 @@ function Charts({ topic, scope, events, pick }) {
     </div><${Marked} events=${events} /></section>`;
 }
 
+/** Returns the seconds of the charts that the stream continues: the agent may keep less in memory. */
+export function liveSpan() {
+  return Math.min(LIVE_SPAN, state.open?.history_seconds ?? LIVE_SPAN);
+}
+
+/** Returns whether the stream continues charts: the disk may have more of their time. */
+export function isInMemory() {
+  return liveSpan() === LIVE_SPAN || !state.open?.keeps_history;
+}
+
+/**
+ * Removes the rows that are older than the charts.
+ * @param {(number|null)[][]} columns the first one has the times
+ * @param {number} now
+ */
+export function shorten(columns, now) {
+  const first = columns[0].findIndex((time) => Number(time) > now - liveSpan());
+  for (const column of columns) column.splice(0, first < 0 ? column.length : first);
+}
+
 /** The events that the charts mark. @param {{events: import('../state.js').Event[]}} props */
 function Marked({ events }) {
   if (!events.length) return null;
@@ -167,18 +187,17 @@ function useLatest(path, topic) {
   const { data } = usePoll(path, HISTORY_AGAIN_MS);
   const latest = useRef({ data, columns: /** @type {(number|null)[][]} */ (COLUMNS.map(() => [])) });
   if (data && data !== latest.current.data) {
-    latest.current = { data, columns: COLUMNS.map((column) => [...(data[column] ?? [])]) };
+    const columns = COLUMNS.map((column) => [...(data[column] ?? [])]);
+    shorten(columns, data.timestamp_seconds);
+    latest.current = { data, columns };
   }
   const { columns } = latest.current;
   const [times] = columns;
   const { rate: hertz, bandwidth: size, lostNow, p50, p99 } = state.figuresOf(topic.id);
   const last = times[times.length - 1] ?? 0;
   if (path != null && hertz != null && state.time >= Number(last) + 0.9) {
-    [state.time, hertz, size, lostNow, p50, p99, null, null].forEach((value, at) => {
-      const own = columns[at];
-      own.push(value);
-      if (own.length > (state.open?.history_seconds ?? LIVE_SPAN)) own.shift();
-    });
+    [state.time, hertz, size, lostNow, p50, p99, null, null].forEach((value, at) => columns[at].push(value));
+    shorten(columns, state.time);
   }
   return columns;
 }
