@@ -62,7 +62,7 @@ export function Topic({ name, query }) {
       </ul>`}
     ${details.data?.source === 'inside' && html`<p class="dim">Rate and messages come from inside
       the processes; the network shows none, and sizes are unknown.</p>`}
-    ${stream.at == null && html`<${LiveMessage} key=${`message ${topic.id}`} topic=${topic} scope=${scope}
+    ${stream.at == null && html`<${LiveMessage} key=${`message ${state.open?.run} ${topic.id}`} topic=${topic} scope=${scope}
       name=${apiName(topic)} events=${events} />`}
     <div class="figures">
       <${Figure} label="rate" value=${rate(figures.rate)} />
