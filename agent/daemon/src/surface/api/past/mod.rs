@@ -2,6 +2,8 @@
 
 mod query;
 mod rates;
+#[cfg(test)]
+mod tests;
 mod topic;
 mod writer;
 
@@ -15,11 +17,11 @@ use utoipa::IntoParams;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
-use super::Context;
 use super::body_stream::lines_of;
 use super::parameters::Parameters;
 use super::problem::{Code, Problem, ProblemBody};
 use super::processes::MAX_PROCESSES;
+use super::{Context, in_turn};
 use ros2probe_api::history::{DiskHistory, HistorySpan, ProcessColumns, ProcessHistory};
 use ros2probe_history::{ProcessName, ProcessRow, Span, Store, merge_by_name};
 
@@ -69,7 +71,7 @@ async fn get_history(State(context): State<Context>) -> Json<DiskHistory> {
         })
     };
     let facts = read_store(&context, Store::facts).await;
-    let facts = facts.unwrap_or_default();
+    let facts = facts.map(|(facts, _)| facts).unwrap_or_default();
     Json(DiskHistory {
         is_kept: history.is_kept(),
         bytes: facts.bytes,
@@ -109,13 +111,14 @@ async fn get_moment(
         let state = store.state(at)?;
         Some(rates::with_rates(&state.content, store, at))
     });
-    let lines = lines.await?.ok_or_else(|| {
+    let (lines, _permit) = lines.await?;
+    let lines = lines.ok_or_else(|| {
         Problem::new(
             Code::NoHistory,
             "no state of that time or before is in the history",
         )
     })?;
-    Ok(lines_of(lines))
+    Ok(in_turn(&context, async { lines_of(lines) }).await)
 }
 
 /// CPU time and memory of the robot's processes
@@ -137,9 +140,9 @@ async fn get_moment(
 async fn processes(
     State(context): State<Context>,
     Parameters(range): Parameters<TimeRange>,
-) -> Result<Json<ProcessHistory>, Problem> {
+) -> Result<Response, Problem> {
     let range = range.checked(query::now(&context))?;
-    let all = read_store(&context, move |store| {
+    let read = read_store(&context, move |store| {
         let mut all = BTreeMap::<ProcessName, Vec<ProcessRow>>::new();
         store.processes(range.times(), range.step, &|_| true, &mut |name, row| {
             if all.len() < MAX_PROCESSES || all.contains_key(name) {
@@ -148,7 +151,8 @@ async fn processes(
         });
         all
     });
-    let columns = all.await?.into_iter().map(|(process, rows)| {
+    let (all, _permit) = read.await?;
+    let columns = all.into_iter().map(|(process, rows)| {
         let cpu = |row: &ProcessRow| {
             let seconds = f64::from(row.seconds.max(1));
             super::history::thousandths(f64::from(row.cpu_ms) / 1e3 / seconds)
@@ -161,10 +165,13 @@ async fn processes(
             memory_bytes: rows.iter().map(|row| row.memory_kib << 10).collect(),
         }
     });
-    Ok(Json(ProcessHistory {
-        interval_seconds: range.step,
-        processes: columns.collect(),
-    }))
+    let answer = async {
+        Json(ProcessHistory {
+            interval_seconds: range.step,
+            processes: columns.collect(),
+        })
+    };
+    Ok(in_turn(&context, answer).await)
 }
 
 /// The events of a time
@@ -189,7 +196,7 @@ async fn events(
     Parameters(range): Parameters<TimeRange>,
 ) -> Result<Response, Problem> {
     let range = range.checked(query::now(&context))?;
-    let text = read_store(&context, move |store| {
+    let read = read_store(&context, move |store| {
         let mut text = Vec::new();
         store.events(range.times(), &mut |lines| {
             if text.len() + lines.len() <= MAX_EVENT_BYTES {
@@ -198,5 +205,6 @@ async fn events(
         });
         text
     });
-    Ok(lines_of(text.await?))
+    let (text, _permit) = read.await?;
+    Ok(in_turn(&context, async { lines_of(text) }).await)
 }
