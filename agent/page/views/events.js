@@ -5,7 +5,7 @@ import { request } from '../api.js';
 import { count, date, eventWords, several, visible, when } from '../format.js';
 import { address } from '../router.js';
 import { replaceAddress, state, useLive } from '../store.js';
-import { inWords, useEvents, useTime } from '../timebar.js';
+import { inWords, useEventHistory, useTime } from '../timebar.js';
 import { Filter, html, Mark, matches, Name } from '../ui.js';
 
 /** Most events in the document; the filter finds older ones. */
@@ -134,7 +134,7 @@ export function Events({ query }) {
   const change = (/** @type {Record<string, any>} */ more) => replaceAddress(
     address('events', null, { ...query, ...more }));
   const shown = useTime();
-  const past = useEvents(shown);
+  const { events: past, isTruncated } = useEventHistory(shown);
   const isPast = shown.at != null || (query.span != null && state.open?.keeps_history);
   // Events before the shown ones name what they mention.
   const names = namesOf([...past, ...state.events], ownersNow());
@@ -158,6 +158,8 @@ export function Events({ query }) {
         onClick=${() => hold(held ? null : [...state.events])}>${held
           ? `Continue${fresh > 0 ? ` (${several(fresh, 'new event')})` : ''}` : 'Pause'}</button>`}</div>
     ${failed && html`<p class="problem"><${Mark} severity="warning" /> No earlier events: ${failed}</p>`}
+    ${isPast && isTruncated && html`<p class="problem"><${Mark} severity="warning" /> The oldest events of
+      this time are too many for one answer. A shorter time has them.</p>`}
     ${state.missedEvents > 0 && html`<p class="dim">${count(state.missedEvents)} events were
       overwritten before this page could read them.</p>`}
     ${rows.length ? html`<div class="scroll tall" tabindex="0" role="group" aria-label="Events"><table>

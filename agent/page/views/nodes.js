@@ -206,7 +206,8 @@ function ProcessCharts({ participants }) {
   const title = inWords(shown);
   const events = useEvents(shown).filter(({ severity }) => severity !== 'INFO');
   const marks = marksOf(events);
-  return own.map((/** @type {any} */ each) => html`<section key=${`${each.process_id} ${each.process}`}
+  return html`${data?.is_truncated && !own.length && html`<p class="problem"><${Mark} severity="warning" /> Processes that
+    ended early in this time are too many for one answer. A shorter time has them.</p>`}${own.map((/** @type {any} */ each) => html`<section key=${`${each.process_id} ${each.process}`}
     aria-label="CPU and memory of ${each.process}"><h2>${title}: <${Name}
       text=${`${each.process} ${each.process_id}`} /></h2><div class="charts">
     <${Chart} title="CPU" times=${each.times} print=${percent} range=${title} select=${zoom}
@@ -215,7 +216,7 @@ function ProcessCharts({ participants }) {
     <${Chart} title="Memory" times=${each.times} print=${bytes} range=${title} select=${zoom} fitted
       marks=${marks}
       lines=${[{ label: 'resident', colour: '--line-2', values: each.memory_bytes }]} />
-    </div></section>`);
+    </div></section>`)}`;
 }
 
 /** @param {{name: string, query: Record<string, string>}} props */
