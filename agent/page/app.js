@@ -258,7 +258,7 @@ function Notice() {
   if (stream.status === 'past') {
     return html`<p class="notice" role="status">${stream.problem
       ? html`<${Mark} severity="warning" /> The robot’s state at that time is unknown:${' '}
-        ${stream.problem.message}. Only charts and events may show it.`
+        ${stream.problem.message}. ${stream.isRetrying ? 'Trying again.' : 'Only charts and events may show it.'}`
       : `The robot as it was at ${date(state.time)}.`}</p>`;
   }
   return null;
@@ -270,7 +270,8 @@ function News() {
   const [text, say] = useState('');
   const ids = state.findings.map((finding) => finding.id).join('\n');
   useEffect(() => {
-    if (!state.batches) return;
+    // Findings of the past are not news, and those of the present are not new after it.
+    if (!state.batches || state.past) return;
     const before = known.current;
     known.current = new Set(state.findings.map((finding) => finding.id));
     if (!before) return;

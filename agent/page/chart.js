@@ -2,7 +2,7 @@
 // All charts of a view share one cursor, which the arrow keys move as well.
 
 import { useEffect, useRef, useState } from './vendor/hooks.mjs';
-import { clock, NOTHING } from './format.js';
+import { clock, date, NOTHING, when } from './format.js';
 import { colour, html } from './ui.js';
 
 const uPlot = /** @type {any} */ (globalThis).uPlot;
@@ -45,6 +45,18 @@ export function around(least, most) {
   if (least == null || most == null) return [0, 1];
   const span = most - least || Math.abs(most) * 0.1 || 1;
   return [least - span * 0.1, most + span * 0.1];
+}
+
+/**
+ * Returns how times of a chart are printed: with the day, unless all are of today.
+ * @param {number[]} times Unix times
+ * @param {number} [now] Unix time
+ * @returns {{tick: (time: number) => string, whole: (time: number) => string}} on the axis, and elsewhere
+ */
+export function printersOf(times, now = Date.now() / 1000) {
+  const isToday = [times[0], times[times.length - 1]].every((time) => when(time, now) === clock(time));
+  if (isToday) return { tick: clock, whole: clock };
+  return { tick: (time) => `${date(time).slice(5, 10)}\n${clock(time)}`, whole: date };
 }
 
 /** @param {string} variable @param {number} alpha a byte */
@@ -97,8 +109,9 @@ export function Chart({ title, times, lines, print, note, whole, fitted, pick, s
     while (place > 0 && lines.every((line) => line.values[place] == null)) place -= 1;
     return place;
   };
-  const latest = useRef({ marks, select, last });
-  latest.current = { marks, select, last };
+  const printers = printersOf(times);
+  const latest = useRef({ marks, select, last, printers });
+  latest.current = { marks, select, last, printers };
   const selected = useRef(false);
   const [asTable, showTable] = useState(false);
   const names = lines.map((line) => line.label).join();
@@ -135,12 +148,13 @@ export function Chart({ title, times, lines, print, note, whole, fitted, pick, s
         : [Math.min(0, least ?? 0), (most || 1) * 1.1]) } },
       axes: [
         { ...axis, values: (/** @type {any} */ _, /** @type {number[]} */ ticks) =>
-          ticks.map(clock), space: 80 },
+          ticks.map(latest.current.printers.tick), space: 80 },
         { ...axis, values: (/** @type {any} */ _, /** @type {number[]} */ ticks) =>
           ticks.map(print), size: 78, ...(whole ? { incrs: WHOLE } : {}) },
       ],
       series: [
-        { label: 'time', value: (/** @type {any} */ _, /** @type {number} */ time) => clock(time) },
+        { label: 'time', value: (/** @type {any} */ _, /** @type {number} */ time) =>
+          latest.current.printers.whole(time) },
         ...lines.map((line) => ({
           label: line.label,
           stroke: () => colour(line.colour),
@@ -233,11 +247,12 @@ export function Bars({ label, bars, kinds, words }) {
  */
 function ValueTable({ title, times, lines, print }) {
   const places = [];
+  const { whole } = printersOf(times);
   for (let at = times.length - 1; at >= 0; at -= 10) places.push(at);
   return html`<div class="scroll" tabindex="0" role="group" aria-label="${title}, as a table">
     <table><thead><tr><th scope="col">time</th>
     ${lines.map((line) => html`<th scope="col" class="number">${line.label}</th>`)}</tr></thead>
-    <tbody>${places.map((at) => html`<tr key=${times[at]}><th scope="row">${clock(times[at])}</th>
+    <tbody>${places.map((at) => html`<tr key=${times[at]}><th scope="row">${whole(times[at])}</th>
       ${lines.map((line) => html`<td class="number">${print(line.values[at] ?? null)}</td>`)}
       </tr>`)}</tbody></table></div>`;
 }

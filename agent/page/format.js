@@ -150,6 +150,15 @@ export function date(seconds) {
 }
 
 /**
+ * Formats the time of day of a Unix time; of another day than today, with its date.
+ * @param {number|null|undefined} seconds
+ * @param {number} [now] Unix time
+ */
+export function when(seconds, now = Date.now() / 1000) {
+  return date(seconds).slice(0, 10) === date(now).slice(0, 10) ? clock(seconds) : date(seconds);
+}
+
+/**
  * Formats a number with its noun: "1 topic", "3 topics".
  * @param {number} number
  * @param {string} noun

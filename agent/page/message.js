@@ -4,7 +4,7 @@
 import { useEffect, useRef, useState } from './vendor/hooks.mjs';
 import { named, Refusal, request } from './api.js';
 import { Chart } from './chart.js';
-import { bytes, clock, count, visible } from './format.js';
+import { bytes, count, visible, when } from './format.js';
 import { Preview } from './preview.js';
 import { Lines } from './state.js';
 import { state, stream, useKept } from './store.js';
@@ -201,6 +201,14 @@ function Follow({ scope, name, topic, events }) {
       abort.abort();
     };
   }, [name, scope, run]);
+  // A stream that was opened again, after an agent that was out of reach, has messages again.
+  const { openings } = state;
+  const opened = useRef(openings);
+  useEffect(() => {
+    if (opened.current === openings) return;
+    opened.current = openings;
+    if (problem || end) again((/** @type {number} */ value) => value + 1);
+  }, [openings]);
   const toggle = (/** @type {string} */ path) => {
     const next = new Set(toggled);
     if (!next.delete(path)) next.add(path);
@@ -213,10 +221,11 @@ function Follow({ scope, name, topic, events }) {
   const plots = plotsOf(plotted.filter((path) => values.has(path)).map((path) =>
     [path, values.get(path) ?? []]), isApart, isRelative);
   const marks = marksOf(events);
+  const button = html`<button type="button" onClick=${() => again(run + 1)}>Again</button>`;
   return html`
-    <${Failed} problem=${problem} what="No messages" />
+    ${problem && html`<div><${Failed} problem=${problem} what="No messages" /><p>${button}</p></div>`}
     ${end && html`<p class="problem"><${Mark} severity="warning" /> The messages end: ${end}.${' '}
-      <button type="button" onClick=${() => again(run + 1)}>Again</button></p>`}
+      ${button}</p>`}
     ${type && !type.known && html`<p><${Mark} severity="note" /> The definition of <${Name}
       text=${type.name} /> is not known: ${type.reason ?? 'no file has it'}. Sizes are shown, fields
       are not.</p>`}
@@ -231,7 +240,7 @@ function Follow({ scope, name, topic, events }) {
     ${plots.length > 0 && html`<div class="charts">${plots.map((lines) => html`<${Chart}
       key=${lines[0].label} title=${lines.map(({ label }) => label).join(', ')} times=${times}
       print=${printNumber} fitted marks=${marks} range="the last messages" lines=${lines} />`)}</div>`}
-    ${message && html`<p class="dim">${clock(message.time)}, ${bytes(message.bytes)}${
+    ${message && html`<p class="dim">${when(message.time)}, ${bytes(message.bytes)}${
       message.sequence_number != null ? `, number ${count(message.sequence_number)}` : ''}${
       message.node ? html` by <${Name} text=${message.node} />` : ''}${message.skipped
       ? `, ${count(message.skipped)} not shown before it` : ''}</p>`}

@@ -3,8 +3,9 @@
 // The agent sends the whole graph when its structure changes, and only the rows whose figures
 // changed. The state is bounded: series keep ten minutes, events the latest thousand.
 
-/** Points of a sparkline. */
+/** Points of a sparkline, and the seconds of each: the last ten minutes. */
 export const STEPS = 60;
+const STEP_SECONDS = 10;
 /** Most events kept. */
 export const MOST_EVENTS = 1000;
 
@@ -79,16 +80,23 @@ export class State {
   /** Time of the source's clock. */
   time = 0;
   stepBegan = 0;
+  stepSeconds = STEP_SECONDS;
   /** @type {{part: number|null, finished: boolean, paused: boolean, speed: number}|null} */ replay = null;
   /** @type {string|null} */ ended = null;
   /** Complete batches of this run of the agent. */
   batches = 0;
+  /** Number of streams that were opened. Events between two streams are not in either. */
+  openings = 0;
   /** Whether this is the state of a moment in the past. */
   past = false;
+  /** Whether nothing is known of that moment. */
+  unknown = false;
 
   /** Resets the state for another run of the agent. */
   clear() {
-    Object.assign(this, new State(), { structure: this.structure + 1, scripts: this.scripts });
+    Object.assign(this, new State(), {
+      structure: this.structure + 1, scripts: this.scripts, openings: this.openings,
+    });
   }
 
   /**
@@ -115,8 +123,16 @@ export class State {
     this.past = true;
   }
 
+  /** Replaces the state by an empty one, of a moment in the past of which nothing is known. @param {number} at */
+  showUnknown(at) {
+    const { open } = this;
+    this.clear();
+    Object.assign(this, { open, time: at, batches: 1, past: true, unknown: true });
+  }
+
   /** @param {any} open */
   takeOpen(open) {
+    this.openings += 1;
     if (!this.open || this.open.run !== open.run || this.past) this.clear();
     this.open = open;
     this.ended = null;
@@ -160,20 +176,19 @@ export class State {
   /** Takes the scripts that interpreters run. @param {any[]} processes as `GET /processes` has them */
   takeProcesses(processes) {
     const before = JSON.stringify([...this.scripts]);
-    for (const { process_id: pid, process, script } of processes) {
-      if (script) this.scripts.set(pid, { process, script });
-      else this.scripts.delete(pid);
-    }
+    this.scripts = new Map(processes.filter(({ script }) => script).map(({ process_id: pid, process, script }) =>
+      [pid, { process, script }]));
     if (JSON.stringify([...this.scripts]) !== before) this.structure += 1;
   }
 
   /**
    * Returns script or program of a process with its id: "robot.py 4711"; empty if it is unknown.
-   * @param {{pid: number|null, process: string|null}|null|undefined} process
+   * @param {{pid: number|null, process: string|null, cgroup?: string|null}|null|undefined} process a
+   *   participant without a control group is on another host
    */
   processName(process) {
     const name = [process?.process, process?.pid].filter((part) => part != null).join(' ');
-    return this.withScripts(name);
+    return process?.cgroup === null ? name : this.withScripts(name);
   }
 
   /** Returns a text with the scripts of the processes that it names. @param {string} text */
@@ -220,13 +235,9 @@ export class State {
     const { rate, bandwidth, lost } = this.totals;
     [rate, bandwidth, lost].forEach((value, at) => this.totalSeries[at].add(value));
     if (!this.stepBegan) this.stepBegan = time;
-    if (time - this.stepBegan < this.stepLength()) return;
+    if (time - this.stepBegan < this.stepSeconds) return;
     this.stepBegan = time;
     for (const series of [...this.series.values(), ...this.totalSeries]) series.step();
-  }
-
-  stepLength() {
-    return (this.open?.history_seconds ?? 600) / STEPS;
   }
 
   /** @param {any} history */
@@ -242,6 +253,7 @@ export class State {
       series.points = (history.totals[at] ?? []).slice(-STEPS);
       return series;
     });
+    this.stepSeconds = history.step_seconds ?? STEP_SECONDS;
     this.stepBegan = history.t.length ? history.t[history.t.length - 1] : 0;
     this.time = this.stepBegan;
   }

@@ -9,6 +9,8 @@ const SILENCE_MS = 5000;
 const SLEEP_MS = 10000;
 const FIRST_WAIT_MS = 1000;
 const LONGEST_WAIT_MS = 10000;
+/** Status of a busy agent. */
+const BUSY = 503;
 
 /** @typedef {'connecting'|'live'|'paused'|'past'|'asleep'|'lost'|'refused'} Status */
 
@@ -35,6 +37,8 @@ export class Stream {
     /** @type {Refusal|null} */ this.problem = null;
     /** @type {AbortController|null} */ this.connection = null;
     /** @type {number|null} Unix time of a moment in the past that is shown. */ this.at = null;
+    /** Whether a moment is read again because its agent was out of reach or busy. */
+    this.isRetrying = false;
     this.wait = FIRST_WAIT_MS;
     this.retry = 0;
     this.sleep = 0;
@@ -50,19 +54,18 @@ export class Stream {
   open() {
     if (this.connection || this.status === 'paused') return;
     clearTimeout(this.retry);
+    this.isRetrying = false;
     this.become('connecting', this.problem);
     const connection = new AbortController();
     this.connection = connection;
-    const past = this.at != null;
-    const read = past ? this.visit(connection, Number(this.at)) : this.follow(connection);
+    const { at } = this;
+    const read = at == null ? this.follow(connection) : this.visit(connection, at);
     read.then(() => null, (error) => error).then((error) => {
       if (this.connection !== connection) return;
       this.connection = null;
-      if (past && !(error instanceof Refusal && error.status === 401)) {
-        this.become('past', error instanceof Refusal ? error : null);
-      } else {
-        this.broken(error);
-      }
+      if (at == null) this.broken(error);
+      else if (error) this.missed(at, error);
+      else this.become('past', null);
     });
   }
 
@@ -76,12 +79,15 @@ export class Stream {
   /** Reads the state at a moment. @param {AbortController} connection @param {number} at */
   async visit(connection, at) {
     const lines = await moment(at, connection.signal);
-    if (this.connection === connection) this.state.show(lines);
+    if (this.connection !== connection) return;
+    this.wait = FIRST_WAIT_MS;
+    this.state.show(lines);
   }
 
   /** @param {Status} status */
   close(status) {
     clearTimeout(this.retry);
+    this.isRetrying = false;
     const connection = this.connection;
     this.connection = null;
     connection?.abort();
@@ -111,7 +117,7 @@ export class Stream {
       this.sleep = setTimeout(() => {
         if (this.status !== 'paused' && this.status !== 'refused') this.close('asleep');
       }, SLEEP_MS);
-    } else if (this.status === 'asleep' || this.status === 'lost') {
+    } else if (this.status === 'asleep' || this.status === 'lost' || this.isRetrying) {
       this.wait = FIRST_WAIT_MS;
       this.open();
     }
@@ -154,6 +160,28 @@ export class Stream {
       return;
     }
     this.become('lost', refusal);
+    this.openAgain();
+  }
+
+  /**
+   * Handles that a moment could not be read: its state is unknown, and that of no other time is shown.
+   * @param {number} at @param {unknown} error
+   */
+  missed(at, error) {
+    const refusal = error instanceof Refusal ? error : new Refusal(0, 'the connection was lost');
+    if (refusal.status === 401) {
+      if (this.state.batches > 0) this.state.showUnknown(at);
+      this.become('refused', refusal);
+      return;
+    }
+    this.state.showUnknown(at);
+    this.isRetrying = refusal.status === 0 || refusal.status === BUSY;
+    this.become('past', refusal);
+    if (this.isRetrying) this.openAgain();
+  }
+
+  /** Opens again after a time that grows with each failure. A hidden tab waits until it is visible. */
+  openAgain() {
     if (document.visibilityState === 'hidden') return;
     this.retry = setTimeout(() => this.open(), this.wait);
     this.wait = Math.min(LONGEST_WAIT_MS, this.wait * 2);

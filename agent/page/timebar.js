@@ -77,23 +77,32 @@ export function useHistory(path, { span, at }, ask = json) {
 /** Requests lines of JSON. @param {string} path @param {RequestInit} options */
 async function lines(path, options) {
   const response = await request(path, options);
-  return new Lines().take(await response.text());
+  return { list: new Lines().take(await response.text()),
+    isTruncated: response.headers.get('ros2probe-truncated') === 'true' };
+}
+
+/** Returns the events of a time, as `useEventHistory` does. @param {Shown} shown */
+export function useEvents(shown) {
+  return useEventHistory(shown).events;
 }
 
 /**
- * Returns the events of a time. Without a history on disk, these are the ones that the page knows.
+ * Returns the events of a time, and whether the oldest are missing. Without a history on disk, these are
+ * the ones that the page knows.
  * @param {Shown} shown
- * @returns {import('./state.js').Event[]}
+ * @returns {{events: import('./state.js').Event[], isTruncated: boolean}}
  */
-export function useEvents(shown) {
-  const { data } = useHistory(state.open?.keeps_history ? 'history/events' : null, shown, lines);
+export function useEventHistory(shown) {
+  const isKept = state.open ? state.open.keeps_history : shown.at != null;
+  const { data } = useHistory(isKept ? 'history/events' : null, shown, lines);
   const to = shown.at ?? state.time;
-  const all = new Map([...(data ?? []), ...(shown.at == null ? state.events : [])]
+  const all = new Map([...(data?.list ?? []), ...(shown.at == null ? state.events : [])]
     .map((event) => [event.id, event]));
-  return [...all.values()].filter((event) => {
+  const events = [...all.values()].filter((event) => {
     const time = Date.parse(event.time) / 1000;
     return time > to - shown.span && time <= to + 1;
   });
+  return { events, isTruncated: Boolean(data?.isTruncated) };
 }
 
 /**

@@ -2,6 +2,9 @@
 
 use serde::{Deserialize, Serialize};
 
+/// Header of an answer with `true` if its oldest lines are missing.
+pub const TRUNCATED_HEADER: &str = "ros2probe-truncated";
+
 /// Size and reach of the history on disk.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
@@ -41,6 +44,8 @@ pub struct HistorySpan {
 pub struct ProcessHistory {
     /// Seconds between two rows, at least.
     pub interval_seconds: u32,
+    /// Whether processes that ended early are missing.
+    pub is_truncated: bool,
     /// The processes.
     pub processes: Vec<ProcessColumns>,
 }

@@ -18,7 +18,7 @@ test('rates and sizes keep three digits and a prefix', () => {
 
 test('an absent value is not zero', () => {
   for (const print of [format.rate, format.bytes, format.bandwidth, format.count, format.duration,
-    format.percent, format.clock, format.date]) {
+    format.percent, format.clock, format.date, format.when]) {
     assert.equal(print(null), format.NOTHING);
     assert.equal(print(undefined), format.NOTHING);
     assert.equal(print(NaN), format.NOTHING);
@@ -71,6 +71,13 @@ test('long names keep both ends and never split a character', () => {
   assert.ok(short.startsWith('/xxx') && short.endsWith('\u{1f600}'));
   assert.equal(format.shortened('/short', 21), '/short');
   assert.equal(format.shortened('/short', 1), '…');
+});
+
+test('a time of another day has its date', () => {
+  const at = (/** @type {number} */ day, /** @type {number} */ hour) => new Date(2026, 6, day, hour, 5, 9).getTime() / 1000;
+  assert.equal(format.when(at(2, 0), at(2, 23)), '00:05:09');
+  assert.equal(format.when(at(1, 23), at(2, 0)), '2026-07-01 23:05:09');
+  assert.equal(format.when(at(3, 0), at(2, 23)), '2026-07-03 00:05:09');
 });
 
 test('an age is in whole seconds', () => {

@@ -4,7 +4,8 @@ import { test } from 'node:test';
 globalThis.document = /** @type {any} */ ({ addEventListener() {}, baseURI: 'http://x/' });
 globalThis.window = /** @type {any} */ ({ addEventListener() {} });
 globalThis.location = /** @type {any} */ ({ hash: '' });
-const { huesOf, tinted } = await import('../views/graph.js');
+const { huesOf, pastMoment, tinted } = await import('../views/graph.js');
+const { State } = await import('../state.js');
 const { build } = await import('../graph-model.js');
 const { state } = await import('../store.js');
 
@@ -57,4 +58,15 @@ test('names have different hues as long as there are hues', () => {
   assert.equal(new Set(huesOf(names).values()).size, 12);
   assert.equal(huesOf([...names, 'another']).size, 13);
   assert.deepEqual(huesOf(['b', 'a', 'b']), huesOf(['a', 'b']));
+});
+
+test('a comparison is made again for each moment of the past, and not for each second of the present', () => {
+  const own = new State();
+  const lines = (/** @type {number} */ t) => [{ open: { run: 'r' } }, { values: { t, topics: [], totals: [0, 0, 0, 0] } }];
+  const moments = [60, 61, 61, 120].map((t, at) => {
+    if (at < 2) lines(t).forEach((line) => own.apply(line));
+    else own.show(lines(t));
+    return pastMoment(own);
+  });
+  assert.deepEqual(moments, [null, null, 61, 120]);
 });

@@ -4,7 +4,7 @@ import { test } from 'node:test';
 globalThis.document = /** @type {any} */ ({ addEventListener() {}, baseURI: 'http://x/' });
 globalThis.window = /** @type {any} */ ({ addEventListener() {} });
 globalThis.location = /** @type {any} */ ({ hash: '' });
-const { grouped, Incomplete } = await import('../views/overview.js');
+const { Findings, grouped, Incomplete } = await import('../views/overview.js');
 const { state } = await import('../store.js');
 const { Badges, FLAG_MEANINGS, FLAGS, Meanings } = await import('../ui.js');
 
@@ -34,6 +34,20 @@ test('a page without topics says that writers send whose announcement was missed
   for (const part of ['Writers are active', 'this lacks them', 'sudo rp discover --all']) {
     assert.ok(shown.includes(part), `${part}: ${shown}`);
   }
+});
+
+test('the loss of a finding is that of the table of topics', () => {
+  state.apply({ open: { run: 'r', flags: [], passages: [], access: 'read' } });
+  state.apply({ graph: { participants: [], nodes: [], publishers: [], subscriptions: [],
+    topics: [[1, 0, '/points', 'rt/points', 'topic', ['T'], 0, 0, 1, 3]] } });
+  const row = (/** @type {number|null} */ expected) => state.apply({ values: { t: 1, totals: [0, 0, 0, 1],
+    topics: [[1, 10, 1, 100, 50, 0, null, null, 0, 1, expected]] } });
+  const shown = () => JSON.stringify(Findings({ list: [/** @type {any} */ ({ id: 'l', kind: 'loss', severity: 'warning',
+    topic: 1, node: null, since: null, text: 'messages are lost', remedy: null })] }));
+  row(100);
+  assert.ok(shown().includes('50.0 % since it is measured'), shown());
+  row(null);
+  assert.ok(!shown().includes('since it is measured'));
 });
 
 test('every state of a topic is explained where keys and touch reach it', () => {

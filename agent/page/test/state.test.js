@@ -100,6 +100,18 @@ test('another run of the agent forgets everything, the same one keeps events', (
   assert.equal(state.batches, 0);
 });
 
+test('each stream is counted, because events between two streams are in neither', () => {
+  const state = ready();
+  assert.equal(state.openings, 1);
+  feed(state, { open: OPEN });
+  assert.equal(state.openings, 2);
+  state.showUnknown(5);
+  feed(state, { open: OPEN });
+  state.show([{ open: { ...OPEN, run: 'r0' } }]);
+  feed(state, { open: { ...OPEN, run: 'r2' } });
+  assert.equal(state.openings, 5);
+});
+
 test('history comes first, steps are appended, and ten minutes are kept', () => {
   const state = ready();
   feed(state, { history: {
@@ -113,6 +125,17 @@ test('history comes first, steps are appended, and ten minutes are kept', () => 
   for (let t = 101; t <= 2000; t += 1) feed(state, values(t, []));
   assert.equal(state.pointsOf(1).length, STEPS);
   assert.equal(state.totalSeries[0].points.length, STEPS);
+});
+
+test('steps have the length of the history before them, whatever the agent keeps', () => {
+  for (const history_seconds of [60, 600, 3600]) {
+    const state = new State();
+    feed(state, { open: { ...OPEN, history_seconds } }, { graph: GRAPH },
+      { history: { step_seconds: 10, t: [80, 90], totals: [[1, 2], [3, 4], [0, 0]], topics: [[1, [8, 9]]] } });
+    for (let t = 91; t <= 690; t += 1) feed(state, values(t, [[1, t, 0, 0, 0, 0, null, null, 0, t]]));
+    assert.equal(state.pointsOf(1).length, STEPS, 'ten minutes');
+    assert.deepEqual(state.pointsOf(1).slice(0, 2), [95.5, 105.5]);
+  }
 });
 
 test('events are kept once, in order, and not without end', () => {
@@ -164,9 +187,11 @@ test('lines are cut anywhere', () => {
 test('processes have the name of their script, in texts of the agent too', () => {
   const state = ready();
   const { structure } = state;
+  const local = [...GRAPH.participants[0].slice(0, 7), '/robot.slice'];
+  feed(state, { graph: { ...GRAPH, participants: [local] } });
   state.takeProcesses([{ process_id: 4711, process: 'driver', script: 'lidar.py' },
     { process_id: 12, process: 'rviz2', script: null }]);
-  assert.equal(state.structure, structure + 1);
+  assert.equal(state.structure, structure + 2);
   const participant = state.participants.get(1);
   assert.equal(state.processName(participant), 'lidar.py 4711');
   assert.equal(state.processName({ pid: 12, process: 'rviz2' }), 'rviz2 12');
@@ -180,4 +205,8 @@ test('processes have the name of their script, in texts of the agent too', () =>
   const again = state.structure;
   state.takeProcesses([]);
   assert.equal(state.structure, again);
+  // A process that has ended.
+  state.takeProcesses([{ process_id: 4711, process: 'driver', script: 'lidar.py' }]);
+  state.takeProcesses([{ process_id: 12, process: 'rviz2', script: null }]);
+  assert.equal(state.processName({ pid: 4711, process: 'driver' }), 'driver 4711');
 });

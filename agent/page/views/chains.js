@@ -2,7 +2,7 @@
 
 import { chainAddress, chainsThrough, chosen, graphWords, NO_CHAIN, partsOf, rowsOf, slowest,
   tickText, topicsOf, waterfall, wayOf } from '../chains.js';
-import { clock, count, duration, several, shortened, visible } from '../format.js';
+import { count, duration, several, shortened, visible, when } from '../format.js';
 import { address } from '../router.js';
 import { replaceAddress, state, useLive, usePoll } from '../store.js';
 import { sorted, Table } from '../table.js';
@@ -89,7 +89,7 @@ export function Chains({ query }) {
       cell: (/** @type {any} */ row) => count(row.chain?.messages) },
     { key: 'last', title: 'Last', kind: 'number wide',
       by: (/** @type {any} */ row) => row.chain?.last_seen_seconds,
-      cell: (/** @type {any} */ row) => clock(row.chain?.last_seen_seconds) },
+      cell: (/** @type {any} */ row) => when(row.chain?.last_seen_seconds) },
     { key: 'method', title: 'Method',
       meaning: 'How messages are followed: by their stamps, or by calls inside processes.', kind: 'wide', by: (/** @type {any} */ row) => row.method,
       cell: (/** @type {any} */ row) => html`<${Name} text=${row.method ?? ''} />` },
@@ -154,7 +154,7 @@ export function ChainView({ from, query }) {
       <${Figure} label="maximum" value=${duration(chain.latency.maximum_seconds)} />
       ${limit != null && html`<${Figure} label="limit" value=${duration(limit)} />`}
       <${Figure} label="messages" value=${count(chain.messages)} />
-      <${Figure} label="last message" value=${clock(chain.last_seen_seconds)} /></div>
+      <${Figure} label="last message" value=${when(chain.last_seen_seconds)} /></div>
       <${Waterfall} chain=${chain} limit=${limit} />`}`;
 }
 

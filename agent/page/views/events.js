@@ -2,10 +2,10 @@
 
 import { useEffect, useState } from '../vendor/hooks.mjs';
 import { request } from '../api.js';
-import { clock, count, date, eventWords, several, visible } from '../format.js';
+import { count, date, eventWords, several, visible, when } from '../format.js';
 import { address } from '../router.js';
 import { replaceAddress, state, useLive } from '../store.js';
-import { inWords, useEvents, useTime } from '../timebar.js';
+import { inWords, useEventHistory, useTime } from '../timebar.js';
 import { Filter, html, Mark, matches, Name } from '../ui.js';
 
 /** Most events in the document; the filter finds older ones. */
@@ -104,10 +104,13 @@ export function namesOf(events, known) {
   };
 }
 
-/** Requests the events that the agent keeps, once a run, and returns why they are missing. */
+/**
+ * Requests the events that the agent keeps, once for each stream: a stream has no events from before it
+ * was opened. Returns why they are missing.
+ */
 export function useEarlier() {
   const [failed, fail] = useState('');
-  const run = state.open?.run;
+  const { openings } = state;
   useEffect(() => {
     const abort = new AbortController();
     request('events?after=0&follow=false', { signal: abort.signal })
@@ -118,7 +121,7 @@ export function useEarlier() {
       })
       .catch((error) => { if (!abort.signal.aborted) fail(error.message); });
     return () => abort.abort();
-  }, [run]);
+  }, [openings]);
   return failed;
 }
 
@@ -131,7 +134,7 @@ export function Events({ query }) {
   const change = (/** @type {Record<string, any>} */ more) => replaceAddress(
     address('events', null, { ...query, ...more }));
   const shown = useTime();
-  const past = useEvents(shown);
+  const { events: past, isTruncated } = useEventHistory(shown);
   const isPast = shown.at != null || (query.span != null && state.open?.keeps_history);
   // Events before the shown ones name what they mention.
   const names = namesOf([...past, ...state.events], ownersNow());
@@ -155,12 +158,14 @@ export function Events({ query }) {
         onClick=${() => hold(held ? null : [...state.events])}>${held
           ? `Continue${fresh > 0 ? ` (${several(fresh, 'new event')})` : ''}` : 'Pause'}</button>`}</div>
     ${failed && html`<p class="problem"><${Mark} severity="warning" /> No earlier events: ${failed}</p>`}
+    ${isPast && isTruncated && html`<p class="problem"><${Mark} severity="warning" /> The oldest events of
+      this time are too many for one answer. A shorter time has them.</p>`}
     ${state.missedEvents > 0 && html`<p class="dim">${count(state.missedEvents)} events were
       overwritten before this page could read them.</p>`}
     ${rows.length ? html`<div class="scroll tall" tabindex="0" role="group" aria-label="Events"><table>
       <thead><tr><th scope="col">Time</th><th scope="col">Event</th><th scope="col">What</th></tr></thead>
       <tbody>${rows.slice(0, MOST_SHOWN).map((/** @type {any} */ event) => html`<tr key=${event.id}>
-        <td class="number"><time datetime=${event.time} title=${event.time}>${(isPast ? date : clock)(
+        <td class="number"><time datetime=${event.time} title=${event.time}>${(isPast ? date : when)(
           Date.parse(event.time) / 1000)}</time></td>
         <th scope="row"><${Mark} severity=${SEVERITY[event.severity] ?? 'note'} /> ${eventWords(event)}</th>
         <td><${Attributes} event=${event} names=${names} /></td></tr>`)}</tbody></table></div>

@@ -191,6 +191,15 @@ function Scale({ tint, colours }) {
 const AGAIN = 5;
 
 /**
+ * Returns the time of a state in the past. The present is null: it does not become another one each
+ * second.
+ * @param {State} shown
+ */
+export function pastMoment(shown) {
+  return shown.past ? shown.time : null;
+}
+
+/**
  * Returns what has changed since a moment before.
  * @param {number} seconds 0 = no comparison
  */
@@ -214,7 +223,7 @@ function useDifferences(seconds) {
       })
       .catch((error) => { if (!abort.signal.aborted) fail(error.message); });
     return () => abort.abort();
-  }, [seconds, state.past, attempt]);
+  }, [seconds, pastMoment(state), attempt]);
   const found = useMemo(() => before && differences(before, state), [before, state.structure]);
   return { found, failed, since: before?.time ?? null };
 }
@@ -275,7 +284,7 @@ export function Graph({ query }) {
   const level = query.fold ? 0 : folding.scene === scene ? folding.level : 0;
   options.fold = level;
   const against = Number(query.against) || 0;
-  const compared = useDifferences(state.open?.keeps_history ? against : 0);
+  const compared = useDifferences(state.open?.keeps_history && !state.unknown ? against : 0);
   const drawn = compared.found?.both ?? state;
   const graph = useMemo(() => build(drawn, options, joints), [
     drawn, state.structure, JSON.stringify(query), asked.data, trail, level]);

@@ -57,6 +57,34 @@ function useProcesses() {
   return { byId, answer };
 }
 
+/**
+ * Returns a participant's process. The ids of other hosts, which have no control group here, belong to
+ * other processes.
+ * @template T
+ * @param {import('../state.js').Participant|null|undefined} participant
+ * @param {Map<number, T>} byId
+ */
+export function processOf(participant, byId) {
+  return participant?.cgroup == null ? undefined : byId.get(participant.pid ?? -1);
+}
+
+/**
+ * Returns the usage of the participants' processes. A process id is used again in the course of days:
+ * the processes are those of this name, or without one the latest.
+ * @param {any[]} processes as `GET /history/processes` has them
+ * @param {(import('../state.js').Participant|null|undefined)[]} participants
+ */
+export function usageOf(processes, participants) {
+  const found = participants.flatMap((own) => {
+    if (own?.cgroup == null) return [];
+    const all = processes.filter((each) => each.process_id === own.pid && each.times.length > 1);
+    const names = [own.process, state.scripts.get(own.pid ?? -1)?.script];
+    const named = all.filter((each) => names.includes(each.process));
+    return named.length ? named : all.sort((one, other) => other.times.at(-1) - one.times.at(-1)).slice(0, 1);
+  });
+  return [...new Set(found)];
+}
+
 /** Returns the topics that each node publishes and subscribes to. */
 function ends() {
   /** @type {Map<number, {publishers: Set<number>, subscriptions: Set<number>}>} */
@@ -82,7 +110,7 @@ export function Nodes({ query }) {
     address('nodes', null, { ...query, ...more }));
   const joined = ends();
   const participant = (/** @type {any} */ node) => state.participants.get(node.participants[0]);
-  const process = (/** @type {any} */ node) => byId.get(participant(node)?.pid ?? -1);
+  const process = (/** @type {any} */ node) => processOf(participant(node), byId);
   const where = (/** @type {any} */ node) => [state.processName(participant(node)),
     groupOf(participant(node)?.cgroup)].filter(Boolean).join(', ');
   const number = (/** @type {any} */ node, /** @type {'publishers'|'subscriptions'} */ side) =>
@@ -167,16 +195,19 @@ function Links() {
     </tbody></table></div></section>`;
 }
 
-/** CPU and memory of a node's processes over time. @param {{ids: (number|null|undefined)[]}} props */
-function ProcessCharts({ ids }) {
+/**
+ * CPU and memory of a node's processes over time.
+ * @param {{participants: (import('../state.js').Participant|null|undefined)[]}} props
+ */
+function ProcessCharts({ participants }) {
   const shown = useTime();
   const { data } = useHistory(state.open?.keeps_history ? 'history/processes' : null, shown);
-  const own = (data?.processes ?? []).filter((/** @type {any} */ each) =>
-    ids.includes(each.process_id) && each.times.length > 1);
+  const own = usageOf(data?.processes ?? [], participants);
   const title = inWords(shown);
   const events = useEvents(shown).filter(({ severity }) => severity !== 'INFO');
   const marks = marksOf(events);
-  return own.map((/** @type {any} */ each) => html`<section key=${`${each.process_id} ${each.process}`}
+  return html`${data?.is_truncated && !own.length && html`<p class="problem"><${Mark} severity="warning" /> Processes that
+    ended early in this time are too many for one answer. A shorter time has them.</p>`}${own.map((/** @type {any} */ each) => html`<section key=${`${each.process_id} ${each.process}`}
     aria-label="CPU and memory of ${each.process}"><h2>${title}: <${Name}
       text=${`${each.process} ${each.process_id}`} /></h2><div class="charts">
     <${Chart} title="CPU" times=${each.times} print=${percent} range=${title} select=${zoom}
@@ -185,7 +216,7 @@ function ProcessCharts({ ids }) {
     <${Chart} title="Memory" times=${each.times} print=${bytes} range=${title} select=${zoom} fitted
       marks=${marks}
       lines=${[{ label: 'resident', colour: '--line-2', values: each.memory_bytes }]} />
-    </div></section>`);
+    </div></section>`)}`;
 }
 
 /** @param {{name: string, query: Record<string, string>}} props */
@@ -227,7 +258,7 @@ export function NodeView({ name, query }) {
       <th scope="col" class="number">Memory</th><th scope="col" class="number">Threads</th>
       <th scope="col">Started</th><th scope="col">Control group</th><th scope="col">Participant</th></tr></thead>
     <tbody>${instances.map((own) => {
-      const process = own && byId.get(own.pid ?? -1);
+      const process = processOf(own, byId);
       return own && html`<tr key=${own.guid}><th scope="row"><${Name}
         text=${state.processName(own) || 'unknown'} /></th>
         <td><${Name} text=${own.host ?? 'unknown'} /></td>
@@ -239,7 +270,7 @@ export function NodeView({ name, query }) {
           class="dim"><${Name} text=${own.cgroup ?? ''} /></span></td>
         <td>${own.vendor ?? ''} <${Name} text=${own.guid} /></td></tr>`;
     })}</tbody></table></div></section>
-    <${ProcessCharts} ids=${instances.map((own) => own?.pid)} />
+    <${ProcessCharts} participants=${instances} />
     <${Failed} problem=${details.problem} what="No details" />
     <p hidden=${stream.at != null}>Parameters: ${services.data
       ? known.length ? 'the node has parameter services.' : 'the node has no parameter services.'

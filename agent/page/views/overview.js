@@ -1,6 +1,6 @@
 // Findings with their age and remedy, then totals, then the agent's blind spots.
 
-import { age, bandwidth, clock, count, duration, percent, rate, several } from '../format.js';
+import { age, bandwidth, count, duration, percent, rate, several, when } from '../format.js';
 import { address, findingAddress } from '../router.js';
 import { state, useLive } from '../store.js';
 import { Figure, html, Mark, Name, Sentence, TopicLink, worst, Badges } from '../ui.js';
@@ -9,6 +9,7 @@ const MOST_SHOWN = 50;
 
 export function Overview() {
   useLive();
+  if (state.unknown) return html`<h1 tabindex="-1">Overview</h1><p>What was wrong at that time is not known.</p>`;
   const unseen = state.findings.filter((finding) => finding.kind === 'ability');
   const findings = state.findings.filter((finding) => finding.kind !== 'ability');
   const serious = findings.filter((finding) => finding.severity !== 'note');
@@ -46,7 +47,7 @@ export function Findings({ list }) {
       <span><${Place} finding=${finding} /> <${Sentence} text=${rest(finding)} />${now(finding)}
       ${more.has(finding) && html`
         <span class="dim"> and ${several(more.get(finding) ?? 0, 'other')} of this topic</span>`}
-      ${finding.since != null && html` <span class="dim">since ${clock(finding.since)} (${age(state.time - finding.since)})</span>`}
+      ${finding.since != null && html` <span class="dim">since ${when(finding.since)} (${age(state.time - finding.since)})</span>`}
       ${finding.remedy && html`<br /><span class="remedy">Remedy: <${Sentence} text=${finding.remedy}
         /></span>`}</span></li>`)}</ul>
     ${firsts.length > MOST_SHOWN && html`<p class="dim">${count(firsts.length - MOST_SHOWN)} more.
@@ -86,9 +87,9 @@ export function grouped(list) {
 function now(finding) {
   if (finding.topic == null) return '';
   const figures = state.figuresOf(finding.topic);
-  const { lost, messages } = figures;
-  if (finding.kind === 'loss' && lost != null && lost > 0) {
-    return `, ${percent(lost / (lost + (messages ?? 0)))} since it is measured`;
+  const { lost, expected } = figures;
+  if (finding.kind === 'loss' && lost != null && lost > 0 && expected) {
+    return `, ${percent(lost / expected)} since it is measured`;
   }
   if (finding.kind === 'watch_violated' && figures.rate != null) {
     const latency = /latency/.test(finding.text) && figures.p99 != null

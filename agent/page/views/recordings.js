@@ -1,7 +1,7 @@
 // Recordings of the agent, and snapshots of the last seconds in its memory.
 
 import { useRef, useState } from '../vendor/hooks.mjs';
-import { json, post, remove, request } from '../api.js';
+import { json, post, Refusal, remove, request } from '../api.js';
 import { bytes, count, date, several } from '../format.js';
 import { address } from '../router.js';
 import { state, useLive, usePoll } from '../store.js';
@@ -95,18 +95,39 @@ function Write({ name, again }) {
   }}>Write now</${Act}> <span role="status"><${Name} text=${written} /></span>`;
 }
 
+const MOST_DOMAIN = 232;
+
+/** Returns the domains of known participants, in their order. */
+export function domainsNow() {
+  const domains = new Set([...state.participants.values()].map((each) => each.domain));
+  return [...domains].sort((one, other) => one - other);
+}
+
+/**
+ * Returns the domain to record: the chosen one, else the only one that is known.
+ * @param {string|undefined} chosen
+ * @param {number[]} domains that are known
+ * @throws {Refusal} without a domain
+ */
+export function domainOf(chosen, domains) {
+  if (chosen == null && domains.length === 1) return domains[0];
+  const domain = Number(chosen);
+  if (/^\d+$/.test(chosen?.trim() ?? '') && domain <= MOST_DOMAIN) return domain;
+  throw new Refusal(0, `enter the domain, a number from 0 to ${MOST_DOMAIN}`);
+}
+
 /** @param {{again: () => void}} props */
 function Start({ again }) {
   const name = useRef(/** @type {HTMLInputElement|null} */ (null));
   const topics = useRef(/** @type {HTMLInputElement|null} */ (null));
-  const domain = useRef(/** @type {HTMLInputElement|null} */ (null));
-  const domains = [...new Set([...state.participants.values()].map((each) => each.domain))].sort();
+  const domain = useRef(/** @type {HTMLInputElement|HTMLSelectElement|null} */ (null));
+  const domains = domainsNow();
   const start = async () => {
     const chosen = (topics.current?.value ?? '').split(/[\s,]+/).filter(Boolean);
     const own = name.current?.value.trim();
     await post('recordings', {
       ...(own ? { name: own } : {}),
-      domain_id: Number(domain.current?.value ?? domains[0] ?? 0),
+      domain_id: domainOf(domain.current?.value, domains),
       topics: chosen.length ? { topics: chosen } : { all_topics: true },
     });
     if (name.current) name.current.value = '';
@@ -122,6 +143,8 @@ function Start({ again }) {
       autocomplete="off" /></label>
     ${domains.length > 1 && html`<label>Domain <select ref=${domain}>${domains.map((each) => html`
       <option key=${each}>${each}</option>`)}</select></label>`}
+    ${!domains.length && html`<label>Domain <input ref=${domain} type="number" min="0" max=${MOST_DOMAIN}
+      required placeholder="none is known" /></label>`}
     <${Act} action=${start}>Start</${Act}></form></section>`;
 }
 
@@ -136,7 +159,7 @@ function Recording({ recording, again }) {
   };
   return html`<section class="card" aria-label="Recording ${name}">
     <h2><${Name} text=${name} /> <span class="badge ${running ? 'good' : 'note'}">${recording.state}</span></h2>
-    <p>${date(recording.began_timestamp_seconds)}: ${several(report.messages, 'message')}, ${bytes(
+    <p>${date(recording.began_timestamp_seconds)}, domain ${recording.domain_id}: ${several(report.messages, 'message')}, ${bytes(
       recording.file_bytes)} in ${several(recording.files, 'file')}${report.missing > 0
       ? html`; <${Mark} severity="warning" /> ${count(report.missing)} missing` : '; none missing'}
       <br /><span class="dim"><${Name} text=${recording.directory} /></span></p>

@@ -2,7 +2,7 @@
 
 import { useRef, useState } from '../vendor/hooks.mjs';
 import { Bars } from '../chart.js';
-import { age, clock, count, date, duration, rate, several } from '../format.js';
+import { age, clock, count, date, duration, rate, several, when } from '../format.js';
 import { address, clockId, frameId, nodeAddress } from '../router.js';
 import { replaceAddress, state, useLive, usePoll } from '../store.js';
 import { sorted, Table } from '../table.js';
@@ -168,7 +168,7 @@ function Logs({ query, change }) {
         <th scope="col">Text</th></tr></thead>
       <tbody>${rows.slice(0, MOST_SHOWN).map((/** @type {any} */ each) => html`
         <tr key=${`${each.writer} ${each.sequence_number}`}>
-        <td class="number">${clock(each.timestamp_seconds)}</td>
+        <td class="number">${when(each.timestamp_seconds)}</td>
         <td class="level"><${Mark} severity=${SEVERITY[each.level]} /> ${each.level}</td>
         <th scope="row"><${Node} name=${each.ros_node} domain=${each.domain_id} /></th>
         <td>${each.file ? html`<details><summary><${Name} text=${each.text} /></summary><span class="dim"><${Name}
@@ -317,7 +317,7 @@ function Diagnostics({ query, change }) {
       cell: (/** @type {any} */ row) => row.status && age(state.time - since(row)) },
     { key: 'last', title: 'Last', kind: 'number wide', by: (/** @type {any} */ row) =>
       (row.status ? -row.status.timestamp_seconds : null),
-      cell: (/** @type {any} */ row) => row.status && clock(row.status.timestamp_seconds) },
+      cell: (/** @type {any} */ row) => row.status && when(row.status.timestamp_seconds) },
   ];
   const found = all.filter((/** @type {any} */ row) =>
     matches(filter, `${row.level} ${row.name} ${row.message} ${row.hardware_id}`));
@@ -407,7 +407,7 @@ function Frame({ frame, depth, tree, jumps }) {
   return html`<tr id=${frameId(tree.domain_id, tree.namespace, name)}>
     <th scope="row"><span class="depth-${Math.min(8, depth)}"><${Name} text=${name} /></span></th>
     ${edge ? html`<td class="number">${edge.is_static ? 'static' : rate(edge.rate_hz)}</td>
-      <td class="number">${edge.is_static ? clock(edge.timestamp_seconds) : `${duration(
+      <td class="number">${edge.is_static ? when(edge.timestamp_seconds) : `${duration(
         Math.max(0, state.time - edge.timestamp_seconds))} ago`}</td>
       <td class="number">${old != null && old < 0 ? html`<${Mark} severity="warning" /> ${duration(-old)} ahead`
         : duration(old)}</td>
@@ -432,7 +432,7 @@ function Parameters({ query, change }) {
     { key: 'value', title: 'Last known value', cell: (/** @type {any} */ row) => html`<${Long}
       text=${row.value} most=${120} />` },
     { key: 'time', title: 'Seen', kind: 'number wide', by: (/** @type {any} */ row) =>
-      row.timestamp_seconds, cell: (/** @type {any} */ row) => clock(row.timestamp_seconds) },
+      row.timestamp_seconds, cell: (/** @type {any} */ row) => when(row.timestamp_seconds) },
   ];
   const found = all.filter((/** @type {any} */ row) =>
     matches(filter, `${row.ros_node} ${row.name} ${row.value}`));
@@ -441,7 +441,7 @@ function Parameters({ query, change }) {
       <thead><tr><th scope="col">Time</th><th scope="col">Parameter</th><th scope="col">Before</th>
         <th scope="col">Value</th><th scope="col">Requested by</th></tr></thead>
       <tbody>${changes.slice(0, MOST_SHOWN).map((/** @type {any} */ each, /** @type {number} */ at) => html`
-        <tr key=${`${each.timestamp_seconds} ${at}`}><td class="number">${clock(each.timestamp_seconds)}</td>
+        <tr key=${`${each.timestamp_seconds} ${at}`}><td class="number">${when(each.timestamp_seconds)}</td>
         <th scope="row"><${Node} name=${each.ros_node} domain=${each.domain_id} /> <${Name}
           text=${each.name} /></th>
         <td>${each.before == null ? '–' : html`<${Long} text=${each.before} most=${60} />`}</td>

@@ -3,7 +3,7 @@
 import { useRef, useState } from '../vendor/hooks.mjs';
 import { named } from '../api.js';
 import { Chart } from '../chart.js';
-import { bandwidth, clock, count, date, duration, eventWords, percent, rate, several } from '../format.js';
+import { bandwidth, count, date, duration, eventWords, percent, rate, several, when } from '../format.js';
 import { address } from '../router.js';
 import { topicKey } from '../graph-model.js';
 import { LiveMessage } from '../message.js';
@@ -37,8 +37,10 @@ export function Topic({ name, query }) {
   if (!topic) {
     return html`<h1 tabindex="-1"><${Name} text=${name} /></h1>
       <p>No such topic ${stream.at == null ? 'now. It may have had no endpoint since the agent started'
-        : 'at that time'}.${' '}
-      <a href=${address('topics')}>All topics</a></p>`;
+        : state.unknown ? 'is known of that time' : 'at that time'}.${' '}
+      <a href=${address('topics')}>All topics</a></p>
+      ${state.unknown && html`<${Charts} topic=${{ id: 0, name, ddsName: name, kind: 'topic', measured: true }}
+        scope=${scope} events=${eventsOf(known, name)} pick=${() => {}} />`}`;
   }
   const events = eventsOf(known, topic.name);
   const figures = state.figuresOf(topic.id);
@@ -60,7 +62,7 @@ export function Topic({ name, query }) {
       </ul>`}
     ${details.data?.source === 'inside' && html`<p class="dim">Rate and messages come from inside
       the processes; the network shows none, and sizes are unknown.</p>`}
-    ${stream.at == null && html`<${LiveMessage} key=${`message ${topic.id}`} topic=${topic} scope=${scope}
+    ${stream.at == null && html`<${LiveMessage} key=${`message ${state.open?.run} ${topic.id}`} topic=${topic} scope=${scope}
       name=${apiName(topic)} events=${events} />`}
     <div class="figures">
       <${Figure} label="rate" value=${rate(figures.rate)} />
@@ -69,7 +71,7 @@ export function Topic({ name, query }) {
       <${Figure} label="lost" value=${count(figures.lost)} />
       <${Figure} label="latency p50" value=${duration(figures.p50)} />
       <${Figure} label="latency p99" value=${duration(figures.p99)} />
-      <${Figure} label="last message" value=${clock(figures.last)} />
+      <${Figure} label="last message" value=${when(figures.last)} />
     </div>
     <${Clocks} publishers=${details.data?.publishers ?? []} />
     <${Charts} key=${topic.id} topic=${topic} scope=${scope} events=${events} pick=${(/** @type {{time: number}} */
@@ -110,13 +112,13 @@ function Clocks({ publishers }) {
 function Charts({ topic, scope, events, pick }) {
   const shown = useTime();
   const path = named('topics', apiName(topic), `/history${scope}`);
-  const isLive = shown.at == null && shown.span === LIVE_SPAN;
+  const isLive = shown.at == null && shown.span === LIVE_SPAN && isInMemory();
   const latest = useLatest(isLive ? path : null, topic);
   const past = useHistory(isLive ? null : path, shown);
   const columns = isLive ? latest : COLUMNS.map((column) => past.data?.[column] ?? []);
   const marks = marksOf(events);
   const [times, rates, sizes, lost, half, most, gapHalf, gapMost] = columns;
-  const title = inWords(shown);
+  const title = inWords(isLive ? { at: null, span: liveSpan() } : shown);
   if (!times.length) {
     return html`<p class="dim">${past.problem ? `No history: ${past.problem.message}`
       : !isLive && !past.data ? 'Reading the history …'
@@ -147,6 +149,26 @@ function Charts({ topic, scope, events, pick }) {
     </div><${Marked} events=${events} /></section>`;
 }
 
+/** Returns the seconds of the charts that the stream continues: the agent may keep less in memory. */
+export function liveSpan() {
+  return Math.min(LIVE_SPAN, state.open?.history_seconds ?? LIVE_SPAN);
+}
+
+/** Returns whether the stream continues charts: the disk may have more of their time. */
+export function isInMemory() {
+  return liveSpan() === LIVE_SPAN || !state.open?.keeps_history;
+}
+
+/**
+ * Removes the rows that are older than the charts.
+ * @param {(number|null)[][]} columns the first one has the times
+ * @param {number} now
+ */
+export function shorten(columns, now) {
+  const first = columns[0].findIndex((time) => Number(time) > now - liveSpan());
+  for (const column of columns) column.splice(0, first < 0 ? column.length : first);
+}
+
 /** The events that the charts mark. @param {{events: import('../state.js').Event[]}} props */
 function Marked({ events }) {
   if (!events.length) return null;
@@ -165,18 +187,17 @@ function useLatest(path, topic) {
   const { data } = usePoll(path, HISTORY_AGAIN_MS);
   const latest = useRef({ data, columns: /** @type {(number|null)[][]} */ (COLUMNS.map(() => [])) });
   if (data && data !== latest.current.data) {
-    latest.current = { data, columns: COLUMNS.map((column) => [...(data[column] ?? [])]) };
+    const columns = COLUMNS.map((column) => [...(data[column] ?? [])]);
+    shorten(columns, data.timestamp_seconds);
+    latest.current = { data, columns };
   }
   const { columns } = latest.current;
   const [times] = columns;
   const { rate: hertz, bandwidth: size, lostNow, p50, p99 } = state.figuresOf(topic.id);
   const last = times[times.length - 1] ?? 0;
   if (path != null && hertz != null && state.time >= Number(last) + 0.9) {
-    [state.time, hertz, size, lostNow, p50, p99, null, null].forEach((value, at) => {
-      const own = columns[at];
-      own.push(value);
-      if (own.length > (state.open?.history_seconds ?? LIVE_SPAN)) own.shift();
-    });
+    [state.time, hertz, size, lostNow, p50, p99, null, null].forEach((value, at) => columns[at].push(value));
+    shorten(columns, state.time);
   }
   return columns;
 }

@@ -1,9 +1,9 @@
 // All topics in one table: filtered, sorted, measured on request.
 
-import { named, post, remove } from '../api.js';
+import { named, post, Refusal, remove } from '../api.js';
 import { bandwidth, count, duration, percent, rate, visible } from '../format.js';
 import { address } from '../router.js';
-import { replaceAddress, state, useLive } from '../store.js';
+import { replaceAddress, state, stream, useLive } from '../store.js';
 import { sorted, Table } from '../table.js';
 import { Act, Badges, FLAGS, FLAG_MEANINGS, Filter, html, matches, Name, Spark, TopicLink, worst } from '../ui.js';
 import { Incomplete } from './overview.js';
@@ -18,10 +18,20 @@ const ONLY = /** @type {Record<string, [string, (topic: any) => boolean]>} */ ({
   unmeasured: ['not measured', (topic) => !topic.measured],
 });
 
-/** Switches measuring on or off. @param {import('../state.js').Topic} topic */
-export function watch(topic) {
-  const path = `${named('watch', watchName(topic))}?domain_id=${topic.domain}`;
-  return topic.measured && topic.watched !== 0 ? remove(path) : post(path);
+/**
+ * Switches measuring on or off. A watch of this domain precedes one of all domains.
+ * @param {import('../state.js').Topic} topic
+ */
+export async function watch(topic) {
+  const everywhere = named('watch', watchName(topic));
+  const path = `${everywhere}?domain_id=${topic.domain}`;
+  if (!topic.measured || topic.watched === 0) return post(path);
+  try {
+    return await remove(path);
+  } catch (error) {
+    if (!(error instanceof Refusal && error.code === 'no-such-watch')) throw error;
+    return remove(everywhere);
+  }
 }
 
 // A topic without a ROS name is watched by its DDS name.
@@ -45,7 +55,7 @@ export function Measure({ topic }) {
   const on = topic.measured && topic.watched !== 0;
   if (why) return html`<span class="dim">on (${why})</span>`;
   return html`<${Act} action=${() => watch(topic)} pressed=${on} kind="switch"
-    disabled=${!state.may('watch')} label="${on ? 'on' : 'off'}: measure ${visible(topic.name)}">${on ? 'on' : 'off'}</${Act}>`;
+    disabled=${stream.at != null || !state.may('watch')} label="${on ? 'on' : 'off'}: measure ${visible(topic.name)}">${on ? 'on' : 'off'}</${Act}>`;
 }
 
 /** @param {{query: Record<string, string>}} props */

@@ -412,16 +412,22 @@ fn a_tab_that_slept_for_a_minute_shows_the_present_state() -> Result<()> {
     let place = Place::new()?;
     let _agent = place.agent("watch: [/**]\n")?;
     let _robot = Robot::start(&place.host)?;
-    let mut other = None;
+    let mut others = Vec::new();
     let mut answers = |question: &str| match question {
         "another topic" => {
-            other = Some(place.publisher("/while_asleep", "/night_watch")?);
+            others.push(place.publisher("/while_asleep", "/night_watch")?);
+            Ok(json!({}))
+        }
+        "a node while hidden" => {
+            others.push(place.publisher("/hidden", "/while_hidden")?);
+            // The event precedes the next stream.
+            std::thread::sleep(Duration::from_secs(3));
             Ok(json!({}))
         }
         _ => Ok(json!({"live": place.streams()?})),
     };
     let played = play(&place.inside(), "asleep", &[PAGE], &mut answers);
-    drop(other);
+    drop(others);
     played
 }
 

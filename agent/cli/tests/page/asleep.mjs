@@ -45,11 +45,16 @@ await scenario(async (open) => {
   });
 
   // Hidden: after ten seconds the agent has one stream less to compute.
+  await tab.page.getByRole('navigation').getByRole('link', { name: 'Events' }).click();
+  await tab.shows('/night_watch');
   assert.equal((await ask('streams')).live, 1);
   await tab.page.evaluate(() => globalThis.becomeVisible(false));
   await until('the stream is closed', async () => (await ask('streams')).live === 0);
+  await ask('a node while hidden');
   await tab.page.evaluate(() => globalThis.becomeVisible(true));
   await tab.live();
+  // Events of the hidden time are in the list.
+  await tab.shows('/while_hidden');
   await until('the stream is open', async () => (await ask('streams')).live === 1);
   // The stream stays open while the tab is hidden only briefly.
   const opened = () => tab.requests.filter((request) => request.url().endsWith('/live')).length;

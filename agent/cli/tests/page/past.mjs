@@ -21,6 +21,8 @@ await scenario(async (open) => {
   const chart = row('/imu').locator('.spark path');
   await until('its small chart', async () => /L/.test(await chart.getAttribute('d')));
   await tab.accessible('the past');
+  // No switch of the past changes what is measured now.
+  assert.equal(await page.locator('main button.switch:enabled').count(), 0);
 
   // Its links keep the time.
   await row('/imu').getByRole('link', { name: '/imu' }).click();
@@ -59,14 +61,40 @@ await scenario(async (open) => {
   await page.goto(`${page.url().split('#')[0]}#/topics?at=1000000`);
   await reads(page.locator('.notice'), 'The robot’s state at that time is unknown');
   tab.expect(/^error: Failed to load resource.*404/);
+  // No other time is shown in its place.
+  await gone(page.locator('main tbody tr[data-row]'));
+  await page.goto(`${page.url().split('#')[0]}#/?at=1000000`);
+  await reads(page.locator('main'), 'not known');
+  assert.doesNotMatch(await tab.text(), /Nothing is broken/);
+  // A bookmark of it is not stuck, and one of a moment that is lost on the way is read again.
+  await page.goto('about:blank');
+  await page.goto(`${tab.address}#/topics?at=1000000`);
+  await reads(page.locator('.notice'), 'The robot’s state at that time is unknown');
+  await tab.accessible('a time without an agent');
+  tab.expect(/^error: Failed to load resource: net::ERR_/);
+  await page.route('**/history/moment*', (route) => route.abort());
+  await page.goto(`${page.url().split('#')[0]}#/topics?at=${end}`);
+  await reads(page.locator('.notice'), 'Trying again');
+  await gone(page.locator('main tbody tr[data-row]'));
+  await page.unroute('**/history/moment*');
+  await reads(page.locator('.notice'), 'The robot as it was');
+  await row('/imu').waitFor();
 
   await page.getByRole('button', { name: 'Now' }).click();
   await tab.live();
   await row('/after_restart').waitFor();
   await gone(page.locator('.notice'));
 
-  // The graph compared with a moment before the restart.
-  await page.goto(`${page.url().split('#')[0]}#/graph?against=3`);
+  // The present has its events again after the past.
+  await page.getByRole('navigation').getByRole('link', { name: 'Events' }).click();
+  await reads(page.locator('main'), '/other');
+  await page.getByRole('button', { name: 'Earlier' }).click();
+  await page.getByRole('button', { name: 'Now' }).click();
+  await tab.live();
+  await reads(page.locator('main'), /node appeared[^]*\/other/);
+
+  // The graph compared with a moment before the restart. The new agent may have written a state since.
+  await page.goto(`${page.url().split('#')[0]}#/graph?against=${Math.floor(Date.now() / 1000) - end}`);
   const differences = page.getByRole('region', { name: 'Differences' });
   await reads(differences, /New nodes[^]*\/other/);
   await reads(differences, /Nodes that went[^]*\/lidar/);
@@ -75,4 +103,27 @@ await scenario(async (open) => {
   }
   await there(page.getByRole('button', { name: /^− \/lidar .*, went/ }));
   await tab.inked();
+
+  // In the past, each moment has a comparison of its own. Two moments without /lidar are shown: a minute
+  // before the first one it was still there.
+  const [first, second] = [end + 100, end + 200];
+  const former = await page.evaluate((at) => fetch(`history/moment?at=${at}`).then((answer) => answer.text()), end);
+  const without = former.split('\n').map((line) => {
+    const { graph } = line.startsWith('{"graph"') ? JSON.parse(line) : {};
+    return graph ? JSON.stringify({ graph: { ...graph, nodes: graph.nodes.filter((row) => row[2] !== '/lidar') } }) : line;
+  }).join('\n');
+  await page.route('**/history/moment*', async (route) => {
+    const at = Number(new URL(route.request().url()).searchParams.get('at'));
+    const lines = (at < first ? former : without).replace(/"t":[\d.]+/, `"t":${at}`);
+    await route.fulfill({ contentType: 'application/x-ndjson', body: lines });
+  });
+  await page.goto(`${page.url().split('#')[0]}#/graph?against=60&at=${first}`);
+  await reads(differences, /Nodes that went[^]*\/lidar/);
+  await page.goto(`${page.url().split('#')[0]}#/graph?against=60&at=${second}`);
+  await reads(differences, /the same nodes, topics and QoS/);
+  const moved = await differences.innerText();
+  await page.goto('about:blank');
+  await page.goto(`${tab.address}#/graph?against=60&at=${second}`);
+  await reads(differences, /the same nodes, topics and QoS/);
+  assert.equal(await differences.innerText(), moved);
 });

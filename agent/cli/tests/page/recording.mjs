@@ -10,6 +10,8 @@ await scenario(async (open) => {
   // The browser itself writes a refusal to the console.
   tab.expect(/the server responded with a status of 422/);
   await tab.shows('No recording yet.');
+  // Without a robot the form has a field for the domain.
+  await gone(tab.page.getByRole('spinbutton', { name: 'Domain' }));
   await tab.page.getByRole('combobox', { name: 'Topics' }).fill('/imu /scan');
   await tab.page.getByLabel('Name').fill('lap one');
   await tab.page.getByRole('button', { name: 'Start', exact: true }).click();
@@ -22,6 +24,7 @@ await scenario(async (open) => {
   await card.waitFor();
   await until('messages', async () => /[1-9][\d,]* messages/.test(await card.innerText()));
   assert.deepEqual((await ask('recordings')).names, ['lap-one']);
+  assert.match(await card.innerText(), /, domain 0: /);
 
   await card.getByRole('button', { name: 'Pause lap-one' }).click();
   await until('paused', async () => (await card.innerText()).includes('paused'));

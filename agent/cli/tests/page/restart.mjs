@@ -2,7 +2,7 @@
 // It continues without a reload, with only the new agent's state.
 
 import assert from 'node:assert/strict';
-import { ask, gone, scenario, until } from './tab.mjs';
+import { ask, gone, reads, scenario, until } from './tab.mjs';
 
 await scenario(async (open) => {
   const tab = await open({ fragment: '#/topics' });
@@ -38,9 +38,18 @@ await scenario(async (open) => {
   await tab.page.getByRole('link', { name: 'Agent', exact: true }).click();
   await tab.shows(/Stream\s+live/);
 
-  // The agent is killed.
+  // The agent is killed while messages are shown. They go on with the next agent.
+  await tab.page.getByRole('navigation').getByRole('link', { name: 'Topics' }).click();
+  await row('/after_restart').getByRole('link').click();
+  const message = tab.page.locator('section[aria-labelledby="live"]');
+  await reads(message, /number [\d,]+ by \/other/);
   await ask('kill');
   await tab.shows('No connection', 'body');
+  await reads(message, 'the connection was lost');
+  await message.getByRole('button', { name: 'Again' }).waitFor();
   await ask('start');
   await tab.live();
+  await ask('another robot');
+  await gone(message.getByText('the connection was lost'));
+  await reads(message, /number [\d,]+ by \/other/);
 });

@@ -201,6 +201,8 @@ fn nouns(context: Option<&Context>) -> OpenApiRouter<Context> {
         .merge(needs(Access::All, Access::All, downloads::routes()))
         .merge(needs(Access::All, Access::All, snapshots::routes()))
         .merge(turns(views()))
+        .merge(topics::part_routes())
+        .merge(past::routes())
         .merge(calls(turns(inside::routes())))
         .merge(calls(turns(why::routes())))
         .merge(processes::routes())
@@ -227,7 +229,6 @@ fn views() -> OpenApiRouter<Context> {
         .merge(participants::routes())
         .merge(graph::routes())
         .merge(names::routes())
-        .merge(past::routes())
         .merge(clocks::routes())
 }
 
@@ -244,23 +245,20 @@ async fn observe_calls(
 /// Large answers that are being created and read.
 static VIEW_RESPONSES: LargeResponses = LargeResponses::new();
 
-/// Marks a streamed response, which is sent as it is produced and keeps no permit for a large
-/// answer.
-#[derive(Clone, Copy, Debug)]
-struct Streamed;
-
-/// Limits the number of large answers, as [`super::large_responses`] describes.
+/// Creates the answers of some routes as [`in_turn`] does.
 async fn take_turns(Extract(context): Extract<Context>, request: Request, next: Next) -> Response {
+    in_turn(&context, next.run(request)).await
+}
+
+/// Limits the number of large answers, as [`super::large_responses`] describes. A route that waits
+/// for a storage calls this when it has read: a slow storage must not delay other answers.
+async fn in_turn(context: &Context, answer: impl Future<Output = impl IntoResponse>) -> Response {
     let Some(turn) = VIEW_RESPONSES.permit().await else {
         context.limits.reached(Limit::ApiClients, 1);
         let detail = "memory for responses is used up by slow readers";
         return Problem::new(Code::TooManyClients, detail).into_response();
     };
-    let response = next.run(request).await;
-    if response.extensions().get::<Streamed>().is_some() {
-        return response;
-    }
-    let (mut head, body) = response.into_parts();
+    let (mut head, body) = answer.await.into_response().into_parts();
     match to_bytes(body, usize::MAX).await {
         Ok(bytes) => {
             head.headers.insert(CONTENT_LENGTH, bytes.len().into());

@@ -11,7 +11,6 @@ use utoipa::IntoParams;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
-use super::Context;
 use super::endpoint::{endpoint, printed, texts};
 use super::finding::diagnosis;
 use super::history;
@@ -27,6 +26,7 @@ use super::reasons::ReasonInputs;
 use super::scope::{Domain, Scope, only};
 use super::security::Rights;
 use super::watch::expectations;
+use super::{Context, in_turn};
 use crate::agent_facts::{Ability, SourceKind};
 use crate::snapshot_cell::State as AgentState;
 use crate::watches::ActiveWatches;
@@ -41,9 +41,13 @@ use ros2probe_model::report::snapshot::{
 };
 
 pub(super) fn routes() -> OpenApiRouter<Context> {
-    OpenApiRouter::new()
-        .routes(routes!(list))
-        .routes(routes!(show))
+    OpenApiRouter::new().routes(routes!(list))
+}
+
+/// Returns the route of one topic and of its parts. Large answers take turns here, because some
+/// parts wait for a storage, and others are streams.
+pub(super) fn part_routes() -> OpenApiRouter<Context> {
+    OpenApiRouter::new().routes(routes!(show))
 }
 
 /// All topics
@@ -101,26 +105,33 @@ async fn show(
     match aspect(&context, &uri, &name) {
         Some((topic, Aspect::History)) => {
             let Parameters(question) = Parameters::<TopicRange>::of(&uri)?;
-            return match question.parts() {
-                (domain, None) => history::show(&context, topic, domain).await,
+            match question.parts() {
+                (domain, None) => {
+                    Ok(in_turn(&context, history::show(&context, topic, domain)).await)
+                }
                 (domain, Some(range)) => past::show_topic(&context, topic, domain, range).await,
-            };
+            }
         }
         Some((topic, Aspect::Definition)) => {
             let Parameters(domain) = Parameters::of(&uri)?;
-            return messages::definition(&context, topic, domain).await;
+            messages::definition(&context, topic, domain).await
         }
         Some((topic, Aspect::Messages)) => {
             let Parameters(wanted) = Parameters::of(&uri)?;
-            return messages::follow(context.clone(), &granted, topic, wanted).await;
+            messages::follow(context.clone(), &granted, topic, wanted).await
         }
-        None => {}
+        None => {
+            let Parameters(domain) = Parameters::of(&uri)?;
+            Ok(in_turn(&context, details(&context, &name, domain)).await)
+        }
     }
-    let Parameters(domain) = Parameters::<Domain>::of(&uri)?;
+}
+
+async fn details(context: &Context, name: &str, domain: Domain) -> Result<Response, Problem> {
     let domain = domain.checked()?;
     let (state, in_force) = (context.state().await, context.watches.active());
     let answers = TopicAnswers::new(&state, &in_force);
-    let topic = find(answers.snapshot, &name, domain)?;
+    let topic = find(answers.snapshot, name, domain)?;
     Ok(Json(answers.details(topic)).into_response())
 }
 

@@ -22,12 +22,12 @@ use tokio::task::spawn_blocking;
 use tokio::time::{Instant, sleep_until};
 use utoipa::{IntoParams, ToSchema};
 
+use super::Context;
 use super::body_stream::{Pieces, lines_of, stream_of, write_line};
 use super::problem::{Code, Problem, ProblemBody};
 use super::scope::Domain;
 use super::security::Rights;
 use super::topics::{TopicParameter, find};
-use super::{Context, Streamed};
 use crate::config::Access;
 use crate::subscriptions::{Depth, Item, Overflow, Refused, Request, Selection, Subscription};
 use ros2probe_api::messages::{self, Beat, Definition, End, Message, Missed};
@@ -205,9 +205,7 @@ pub(super) async fn follow(
         _permit: permit,
         context,
     };
-    let mut response = lines_of(Body::from_stream(stream_of(stream)));
-    response.extensions_mut().insert(Streamed);
-    Ok(response)
+    Ok(lines_of(Body::from_stream(stream_of(stream))))
 }
 
 /// Returns the subscription of a stream. A request topic has the ROS name of its service, so only

@@ -1,38 +1,40 @@
 //! `/history`: what the agent keeps on disk of the last days, and the robot as it was at a moment.
 
 mod event_range;
+mod latest;
 mod query;
 mod rates;
+#[cfg(test)]
+mod tests;
 mod topic;
 mod writer;
 
-use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use axum::Json;
 use axum::extract::State;
+use axum::http::HeaderValue;
 use axum::response::Response;
 use serde::Deserialize;
 use utoipa::IntoParams;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
-use super::Context;
 use super::body_stream::lines_of;
 use super::parameters::Parameters;
 use super::problem::{Code, Problem, ProblemBody};
-use super::processes::MAX_PROCESSES;
-use ros2probe_api::history::{DiskHistory, HistorySpan, ProcessColumns, ProcessHistory};
-use ros2probe_history::{ProcessName, ProcessRow, Span, Store, merge_by_name};
+use super::{Context, in_turn};
+use latest::{LatestEvents, LatestProcesses};
+use ros2probe_api::history::{
+    DiskHistory, HistorySpan, ProcessColumns, ProcessHistory, TRUNCATED_HEADER,
+};
+use ros2probe_history::{ProcessRow, Span, Store};
 
 use event_range::EventRange;
 pub(super) use query::TopicRange;
 use query::{TimeRange, read_store};
 pub(super) use topic::show as show_topic;
 pub use writer::HistoryWriter;
-
-/// Maximum length of the events in one answer, in bytes.
-const MAX_EVENT_BYTES: usize = 8 << 20;
 
 pub(super) fn routes() -> OpenApiRouter<Context> {
     OpenApiRouter::new()
@@ -72,7 +74,7 @@ async fn get_history(State(context): State<Context>) -> Json<DiskHistory> {
         })
     };
     let facts = read_store(&context, Store::facts).await;
-    let facts = facts.unwrap_or_default();
+    let facts = facts.map(|(facts, _)| facts).unwrap_or_default();
     Json(DiskHistory {
         is_kept: history.is_kept(),
         bytes: facts.bytes,
@@ -112,18 +114,20 @@ async fn get_moment(
         let state = store.state(at)?;
         Some(rates::with_rates(&state.content, store, at))
     });
-    let lines = lines.await?.ok_or_else(|| {
+    let (lines, _permit) = lines.await?;
+    let lines = lines.ok_or_else(|| {
         Problem::new(
             Code::NoHistory,
             "no state of that time or before is in the history",
         )
     })?;
-    Ok(lines_of(lines))
+    Ok(in_turn(&context, async { lines_of(lines) }).await)
 }
 
 /// CPU time and memory of the robot's processes
 ///
-/// A process is named by its id and its script or program.
+/// A process is named by its id and its script or program. An answer has at most 512 processes, the
+/// latest ones.
 #[utoipa::path(
     get,
     path = "/history/processes",
@@ -140,18 +144,28 @@ async fn get_moment(
 async fn processes(
     State(context): State<Context>,
     Parameters(range): Parameters<TimeRange>,
-) -> Result<Json<ProcessHistory>, Problem> {
+) -> Result<Response, Problem> {
     let range = range.checked(query::now(&context))?;
-    let all = read_store(&context, move |store| {
-        let mut all = BTreeMap::<ProcessName, Vec<ProcessRow>>::new();
+    let read = read_store(&context, move |store| {
+        let mut latest = LatestProcesses::default();
         store.processes(range.times(), range.step, &|_| true, &mut |name, row| {
-            if all.len() < MAX_PROCESSES || all.contains_key(name) {
-                merge_by_name(&mut all, name, row, range.step);
-            }
+            latest.add(name, row, range.step);
         });
-        all
+        latest
     });
-    let columns = all.await?.into_iter().map(|(process, rows)| {
+    let (latest, _permit) = read.await?;
+    let answer = async {
+        Json(ProcessHistory {
+            interval_seconds: range.step,
+            is_truncated: latest.is_truncated(),
+            processes: columns(latest),
+        })
+    };
+    Ok(in_turn(&context, answer).await)
+}
+
+fn columns(latest: LatestProcesses) -> Vec<ProcessColumns> {
+    let columns = latest.into_rows().map(|(process, rows)| {
         let cpu = |row: &ProcessRow| {
             let seconds = f64::from(row.seconds.max(1));
             super::history::thousandths(f64::from(row.cpu_ms) / 1e3 / seconds)
@@ -164,16 +178,13 @@ async fn processes(
             memory_bytes: rows.iter().map(|row| row.memory_kib << 10).collect(),
         }
     });
-    Ok(Json(ProcessHistory {
-        interval_seconds: range.step,
-        processes: columns.collect(),
-    }))
+    columns.collect()
 }
 
 /// The events of a time
 ///
 /// Each line is an event, as in `/events`, also one that is not on disk yet. If they are more than
-/// 8 MiB, the latest are missing.
+/// 8 MiB, the oldest are missing.
 #[utoipa::path(
     get,
     path = "/history/events",
@@ -181,7 +192,9 @@ async fn processes(
     params(TimeRange),
     responses(
         (status = 200, description = "The events, the oldest first.",
-            body = ros2probe_api::events::Event<'static>, content_type = "application/x-ndjson"),
+            body = ros2probe_api::events::Event<'static>, content_type = "application/x-ndjson",
+            headers(("ros2probe-truncated" = String,
+                description = "`true` if the oldest events are missing, else absent."))),
         (status = 404, description = "No history is kept.",
             body = ProblemBody, content_type = "application/problem+json"),
         (status = 422, description = "A time or the step is invalid.",
@@ -194,17 +207,22 @@ async fn events(
 ) -> Result<Response, Problem> {
     let range = range.checked(query::now(&context))?;
     let log = Arc::clone(&context.events);
-    let text = read_store(&context, move |store| {
-        let mut text = Vec::new();
-        let mut add = |lines: &[u8]| {
-            if text.len() + lines.len() <= MAX_EVENT_BYTES {
-                text.extend_from_slice(lines);
-            }
-        };
+    let read = read_store(&context, move |store| {
+        let mut latest = LatestEvents::default();
         let mut selected = EventRange::new(&log, range);
-        store.events(range.times(), &mut |lines| add(&selected.of_block(lines)));
-        add(&selected.unwritten());
-        text
+        store.events(range.times(), &mut |lines| latest.add(&selected.of_block(lines)));
+        latest.add(&selected.unwritten());
+        latest
     });
-    Ok(lines_of(text.await?))
+    let (latest, _permit) = read.await?;
+    let answer = async {
+        let is_truncated = latest.is_truncated();
+        let mut response = lines_of(latest.into_lines());
+        if is_truncated {
+            let headers = response.headers_mut();
+            headers.insert(TRUNCATED_HEADER, HeaderValue::from_static("true"));
+        }
+        response
+    };
+    Ok(in_turn(&context, answer).await)
 }

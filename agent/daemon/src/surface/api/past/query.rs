@@ -4,19 +4,19 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use serde::Deserialize;
-use tokio::sync::Semaphore;
+use tokio::sync::{Semaphore, SemaphorePermit};
 use utoipa::IntoParams;
 
 use super::super::Context;
 use super::super::problem::{Code, Problem};
 use super::super::scope::Domain;
-use super::super::turns::{NoResult, run_blocking};
+use super::super::turns::{NoResult, run_blocking_for};
 use super::writer::seconds;
 use ros2probe_history::Store;
 
 /// Number of answers that read the storage at the same time.
-const MAX_READERS: usize = 2;
-static READER_PERMITS: Semaphore = Semaphore::const_new(MAX_READERS);
+pub(super) const MAX_READERS: usize = 2;
+pub(super) static READER_PERMITS: Semaphore = Semaphore::const_new(MAX_READERS);
 /// Maximum number of rows in an answer; a smaller step becomes longer.
 const MAX_ROWS: u32 = 2_000;
 /// Number of rows in an answer without `step`.
@@ -135,27 +135,30 @@ pub(super) fn now(context: &Context) -> u32 {
     seconds(context.latest.state().known().time())
 }
 
+/// Permission to read the store, which ends when the answer is created.
+pub(super) type ReaderPermit = SemaphorePermit<'static>;
+
 /// Reads the store on another thread. A storage that hangs holds [`MAX_READERS`] threads, whatever
 /// the number of clients, and no client longer than [`READ_TIMEOUT`].
 ///
 /// # Errors
 /// Fails if no history is kept, if the storage does not answer, or if the agent stops.
-pub(in super::super) async fn read_store<T: Send + 'static>(
+pub(super) async fn read_store<T: Send + 'static>(
     context: &Context,
     read: impl FnOnce(&Store) -> T + Send + 'static,
-) -> Result<T, Problem> {
+) -> Result<(T, ReaderPermit), Problem> {
     let missing = |detail| Problem::new(Code::NoHistory, detail);
     let none = "no history is kept on disk: it needs a readable state directory, and page.history_bytes above 0";
     let history = Arc::clone(&context.disk_history);
     if !history.is_kept() {
         return Err(missing(none));
     }
-    let answer = run_blocking(&READER_PERMITS, READ_TIMEOUT, move || {
+    let answer = run_blocking_for(&READER_PERMITS, READ_TIMEOUT, move || {
         history.opened().map(read)
     })
     .await;
     match answer {
-        Ok(answer) => answer.ok_or_else(|| missing(none)),
+        Ok((answer, permit)) => Ok((answer.ok_or_else(|| missing(none))?, permit)),
         Err(NoResult::Late) => Err(missing("the storage of the history does not answer")),
         Err(NoResult::Ending) => Err(Problem::new(Code::Ending, "the agent is shutting down")),
     }

@@ -3,13 +3,13 @@
 use std::collections::VecDeque;
 
 use axum::Json;
-use axum::response::{IntoResponse, Response};
+use axum::response::Response;
 
-use super::super::Context;
 use super::super::history::{stored_precision, thousandths};
 use super::super::problem::{Code, Problem};
 use super::super::scope::Domain;
 use super::super::topics::find;
+use super::super::{Context, in_turn};
 use super::query::{self, TimeRange, Times};
 use super::writer::{seconds, topic_row};
 use ros2probe_api::topics::History;
@@ -66,7 +66,7 @@ pub(in super::super) async fn show(
         });
         (times, steps, first)
     });
-    let (times, mut steps, first) = stored.await?;
+    let ((times, mut steps, first), _permit) = stored.await?;
     let (of, name) = match (found, first) {
         (Ok(found), _) => found,
         (Err(_), Some(first)) => (first, name.to_owned()),
@@ -84,7 +84,7 @@ pub(in super::super) async fn show(
     view.topic = name;
     view.domain_id = of.domain_id;
     view.timestamp_seconds = state.known().time().seconds();
-    Ok(Json(view).into_response())
+    Ok(in_turn(context, async { Json(view) }).await)
 }
 
 /// Returns one row for each step, also for steps without a measurement.
