@@ -233,8 +233,8 @@ impl StampWriter {
         let distance = self.least.iter().map(Ages::distance).max();
         let chance = distance.unwrap_or(0).saturating_mul(DRIFT_FACTOR);
         let minimum = MIN_DRIFT_NANOSECONDS.max(chance);
-        let is_steady = steps.iter().all(|step| *step >= minimum)
-            || steps.iter().all(|step| *step <= -minimum);
+        let is_steady =
+            steps.iter().all(|step| *step >= minimum) || steps.iter().all(|step| *step <= -minimum);
         let sum: i64 = steps.iter().sum();
         is_steady.then_some((StampFault::Drifting, sum))
     }
@@ -298,14 +298,19 @@ mod tests {
                 let nanoseconds = u32::try_from(stamp % SECOND).unwrap();
                 let stamp = (i32::try_from(stamp / SECOND).unwrap(), nanoseconds);
                 let number = SequenceNumber(second + 1);
-                stamps.add((Guid::default(), number), (stamp, Timestamp(now)), at, || {
-                    Some(TopicKey {
-                        domain_id: DomainId(0),
-                        dds_name: "rt/map".into(),
-                        name: "/map".into(),
-                        kind: TopicKind::Topic,
-                    })
-                });
+                stamps.add(
+                    (Guid::default(), number),
+                    (stamp, Timestamp(now)),
+                    at,
+                    || {
+                        Some(TopicKey {
+                            domain_id: DomainId(0),
+                            dds_name: "rt/map".into(),
+                            name: "/map".into(),
+                            kind: TopicKind::Topic,
+                        })
+                    },
+                );
             }
             stamps.end_second(at, std::iter::empty());
             let is_drift = |found: &Diagnosis| {

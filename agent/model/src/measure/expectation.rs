@@ -316,7 +316,10 @@ fn window_of(expectations: &Expectations, rate: f64) -> u64 {
 
 /// Returns the interval that `min_rate_hz` expects, and the longest one that it permits; `None` if
 /// its window is long enough to count messages.
-#[expect(clippy::cast_precision_loss, reason = "a window has at most ten seconds")]
+#[expect(
+    clippy::cast_precision_loss,
+    reason = "a window has at most ten seconds"
+)]
 fn longest_interval(expectations: &Expectations) -> Option<(Duration, Duration)> {
     let minimum = expectations.min_rate_hz.filter(|minimum| *minimum > 0.0)?;
     let interval = |seconds: f64| Duration::try_from_secs_f64(seconds).unwrap_or(Duration::MAX);
@@ -645,7 +648,8 @@ mod tests {
     #[test]
     fn a_rate_below_a_message_in_its_window_is_violated_by_one_and_a_half_intervals() {
         let (ok, bad) = (WatchState::Ok, WatchState::Violated);
-        for (minimum, window_s, interval) in [(0.025, None, 40), (0.08, None, 12), (0.5, Some(1), 2)]
+        for (minimum, window_s, interval) in
+            [(0.025, None, 40), (0.08, None, 12), (0.5, Some(1), 2)]
         {
             let mut bench = Bench::new(Expectations {
                 min_rate_hz: Some(minimum),

@@ -294,7 +294,10 @@ fn a_finding_outlives_its_evidence_until_the_clock_is_set_or_the_offset_is_known
     pair.send_from_bob();
     pair.listen(ahead, 10);
     let begun = pair.finding();
-    assert!(begun.is_some_and(|offset| offset > 990_000_000), "{begun:?}");
+    assert!(
+        begun.is_some_and(|offset| offset > 990_000_000),
+        "{begun:?}"
+    );
     // The round trip expires after ten minutes.
     pair.listen(ahead, 15 * 60);
     assert!(pair.offsets().is_empty());

@@ -306,12 +306,18 @@ fn level_in_shared_memory(
 fn a_part_whose_messages_may_pass_unseen_in_shared_memory_is_not_stale() {
     let nothing = |_: &mut VirtualDomain| {};
     let detach = |domain: &mut VirtualDomain| domain.observer.input(Input::ProbesDetached);
-    assert_eq!(level_in_shared_memory(VirtualDomain::put_polled, nothing), Ok);
+    assert_eq!(
+        level_in_shared_memory(VirtualDomain::put_polled, nothing),
+        Ok
+    );
     assert_eq!(level_in_shared_memory(VirtualDomain::put_exact, detach), Ok);
     // The subscription on the network that received these is gone.
     assert_eq!(level_in_shared_memory(VirtualDomain::put, nothing), Ok);
     // A probe would see further messages.
-    assert_eq!(level_in_shared_memory(VirtualDomain::put_exact, nothing), Stale);
+    assert_eq!(
+        level_in_shared_memory(VirtualDomain::put_exact, nothing),
+        Stale
+    );
 }
 
 #[test]

@@ -334,10 +334,14 @@ impl Observer {
 /// Returns whether all messages of a writer pass through shared memory, according to its first
 /// readers.
 fn is_hidden(graph: &Graph, writer: Guid) -> bool {
-    let topic = graph.discovery.endpoints().get(&writer).and_then(|endpoint| {
-        let id = graph.topics.find(endpoint.domain_id, &endpoint.naming()?)?;
-        graph.topics.get(id)
-    });
+    let topic = graph
+        .discovery
+        .endpoints()
+        .get(&writer)
+        .and_then(|endpoint| {
+            let id = graph.topics.find(endpoint.domain_id, &endpoint.naming()?)?;
+            graph.topics.get(id)
+        });
     topic.is_some_and(|topic| {
         let readers = topic.readers.get(..EXAMINED_READERS);
         is_polled(&graph.discovery, writer, readers.unwrap_or(&topic.readers))

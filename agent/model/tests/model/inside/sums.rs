@@ -261,7 +261,11 @@ fn a_transition_between_two_observations_is_one_event() {
     let mut world = World::new();
     let prefix = world.participant(1, 70);
     let events = Guid::new(prefix, EntityId([0, 0, 0x11, 3]));
-    world.announce(events, "rt/lidar/transition_event", robot_states::TRANSITION);
+    world.announce(
+        events,
+        "rt/lidar/transition_event",
+        robot_states::TRANSITION,
+    );
     let lidar = ProcessReport {
         nodes: vec!["/lidar".into()],
         ..process(70)

@@ -210,7 +210,9 @@ async fn events(
     let read = read_store(&context, move |store| {
         let mut latest = LatestEvents::default();
         let mut selected = EventRange::new(&log, range);
-        store.events(range.times(), &mut |lines| latest.add(&selected.of_block(lines)));
+        store.events(range.times(), &mut |lines| {
+            latest.add(&selected.of_block(lines))
+        });
         latest.add(&selected.unwritten());
         latest
     });
