@@ -30,8 +30,8 @@ const DRIFTING_WINDOWS: usize = 4;
 const MIN_DRIFT_NANOSECONDS: i64 = 1_000_000;
 /// Minimum number of messages in a window: the least age of fewer ones is chance.
 const MIN_WINDOW_MESSAGES: u32 = 20;
-/// The drift from one window to the next exceeds this many times the distance between the two least
-/// ages of any window, because the least age varies by about that distance.
+/// Minimum drift from one window to the next, as a multiple of the distance between the two least
+/// ages of any window. The least age varies by about that distance.
 const DRIFT_FACTOR: i64 = 2;
 
 /// The stamps of all publishers whose messages are measured and begin with a header.
