@@ -369,7 +369,7 @@ fn messages_of_a_host_whose_clock_is_behind_are_not_history() {
 /// Returns this time as INFO_TS has it.
 fn stamp(nanoseconds: u64) -> u64 {
     let (seconds, rest) = (nanoseconds / SECOND, nanoseconds % SECOND);
-    seconds << 32 | (rest << 32) / SECOND
+    (seconds << 32) | ((rest << 32) / SECOND)
 }
 
 #[test]
