@@ -164,7 +164,6 @@ fn a_latched_message_that_was_sent_before_does_not_count() {
     let printed = stdout(&output);
     let expected = "min: 0.100s max: 0.100s std dev: 0.00000s window: 16\n";
     assert!(printed.ends_with(expected), "{printed}{}", stderr(&output));
-    assert_eq!(printed, stdout(&run(&[&words[..], &replay].concat())));
 }
 
 #[test]
