@@ -133,8 +133,10 @@ pub struct RobotExpectations {
 #[derive(Debug)]
 pub struct Robot {
     writers: Bounded<Counted<RobotWriters>, HashMap<Guid, RobotWriter>>,
-    /// Whether a full table refused a writer since [`Robot::retry`].
+    /// Whether the full table refused a writer since [`Robot::retry`].
     has_refused: bool,
+    /// The same of the table of writers with frames.
+    has_refused_frame: bool,
     assembly: Assembly,
     allowances: Allowances,
     logs: Logs,
@@ -311,6 +313,7 @@ impl Default for Robot {
         Self {
             writers: Bounded::default(),
             has_refused: false,
+            has_refused_frame: false,
             assembly: Assembly::new(ASSEMBLY_BYTES),
             allowances: Allowances {
                 transforms: CommonAllowance::new(COMMON_BROADCASTER_ALLOWANCE, RESUME_BYTES),
@@ -389,7 +392,7 @@ impl Robot {
         let standard = match reading {
             Reading::Messages(standard) => standard,
             Reading::Frame => {
-                self.has_refused |= !self.frames.follow(writer, domain_id, topic);
+                self.has_refused_frame |= !self.frames.follow(writer, domain_id, topic);
                 return;
             }
         };
@@ -411,26 +414,35 @@ impl Robot {
         }
     }
 
-    /// Returns whether a table refused a writer, and one has room again. The caller should then
-    /// call [`Self::follow`] for each writer that [`Self::has_place_for`] admits.
+    /// Returns whether a table refused a writer and has room again. The caller should then call
+    /// [`Self::follow`] for each writer that [`Self::has_place_for`] admits.
     #[must_use]
     pub fn may_retry(&self) -> bool {
-        self.has_refused && !(self.writers.is_full() && self.frames.is_full())
+        self.has_refused && !self.writers.is_full()
+            || self.has_refused_frame && !self.frames.is_full()
     }
 
     /// Begins a retry. Writers that are refused from now on cause another one.
     pub const fn retry(&mut self) {
-        self.has_refused = false;
+        (self.has_refused, self.has_refused_frame) = (false, false);
     }
 
     /// Returns whether the writer is not followed and its table has room. A table without room
     /// counts as one that refused the writer.
     pub fn has_place_for(&mut self, writer: Guid, reading: Reading) -> bool {
-        let (is_known, is_full) = match reading {
-            Reading::Messages(_) => (self.writers.contains_key(&writer), self.writers.is_full()),
-            Reading::Frame => (self.frames.knows(writer), self.frames.is_full()),
+        let (is_known, is_full, has_refused) = match reading {
+            Reading::Messages(_) => (
+                self.writers.contains_key(&writer),
+                self.writers.is_full(),
+                &mut self.has_refused,
+            ),
+            Reading::Frame => (
+                self.frames.knows(writer),
+                self.frames.is_full(),
+                &mut self.has_refused_frame,
+            ),
         };
-        self.has_refused |= !is_known && is_full;
+        *has_refused |= !is_known && is_full;
         !is_known && !is_full
     }
 
