@@ -191,8 +191,10 @@ function Replay() {
       take(String(error instanceof Error ? error.message : error));
     }
   };
-  /** @param {number} time */
-  const goTo = (time) => go({ to_timestamp_seconds: Math.max(begin, time) });
+  // Without waiting, it would be at its end again.
+  /** @param {number} time @param {boolean} [pauses] */
+  const goTo = (time, pauses = speed === 0) => go({ to_timestamp_seconds: Math.max(begin, time),
+    ...(pauses ? { is_paused: true } : {}) });
   const speeds = SPEEDS.includes(speed) ? SPEEDS : [speed, ...SPEEDS];
   return html`<section class="timebar" aria-label="Time of the replay">
     ${!finished && html`<button type="button" onClick=${() => go({ is_paused: !paused })}>${
@@ -204,9 +206,9 @@ function Replay() {
       onChange=${(/** @type {any} */ event) => goTo(begin + Number(event.target.value))} /></label>
     <span>${date(state.time)}, ${duration(elapsed)} after the begin${
       finished ? ', finished' : part == null ? '' : `, ${percent(part)} read`}</span>
-    ${incident && html`<button type="button" onClick=${() => goTo(Date.parse(incident.time) / 1000)}>
+    ${incident && html`<button type="button" onClick=${() => goTo(Date.parse(incident.time) / 1000, true)}>
       Incident</button> <span>${incident.trigger}, ${date(Date.parse(incident.time) / 1000)}</span>`}
-    <button type="button" disabled=${before == null} onClick=${() => goTo(before ?? begin)}>Previous event</button>
+    <button type="button" disabled=${before == null} onClick=${() => goTo(before ?? begin, true)}>Previous event</button>
     <button type="button" disabled=${state.time <= begin} onClick=${() => goTo(state.time - 60)}>−1 min</button>
     ${!finished && html`<button type="button" onClick=${() => go({ to_next_event: true })}>Next event</button>
     <button type="button" onClick=${() => goTo(state.time + 60)}>+1 min</button>

@@ -392,7 +392,9 @@ fn the_page_continues_after_the_agent_hung_ended_or_was_killed() -> Result<()> {
             "start" => agent = Some(place.agent("watch: [/**]\n")?),
             "forget the robot" => robot = None,
             "another robot" => {
-                other = Some(place.publisher("/after_restart", "/other")?);
+                let topic = "/after_restart";
+                let subscriber = place.subscriber(topic)?;
+                other = Some((subscriber, place.publisher(topic, "/other")?));
             }
             "run" => {
                 let page = place.ask("/health")?;

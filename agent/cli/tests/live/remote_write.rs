@@ -200,7 +200,8 @@ fn samples_survive(engine: Kind, text: &str) -> Result<()> {
     let window = began.elapsed().as_secs() + 5;
     let times = engine.times(&format!("{UP}[{window}s]"))?;
     let first = times.first().copied().unwrap_or_default();
-    ensure!(times.len() > 10, "{times:?}");
+    // Two seconds before the engine, three without a link, and two starts.
+    ensure!(times.len() >= 8, "{times:?}");
     ensure!(first < killed - 4.0, "samples before the outage: {times:?}");
     ensure!(times.is_sorted_by(|one, two| one < two), "{times:?}");
     for pair in times.windows(2) {

@@ -11,7 +11,8 @@ await scenario(async (open) => {
   const bar = tab.page.locator('.timebar');
   await until('the end of the capture', async () => /finished/.test(await bar.innerText()));
   await reads(bar, /2026-\d\d-\d\d \d\d:\d\d:\d\d, .* after the begin/);
-  assert.equal(await bar.getByRole('progressbar').getAttribute('value'), '1');
+  const position = bar.getByRole('slider');
+  assert.equal(await position.inputValue(), await position.getAttribute('max'));
 
   const findings = tab.page.locator('section[aria-labelledby="wrong"]');
   await until('the loss is a finding', async () => /los(t|es)/.test(await findings.innerText()));

@@ -123,6 +123,9 @@ function looked(pattern) {
   return wrong.slice(0, 10);
 }
 
+/** What Chromium writes about a request that it ended because the network of the host changed. */
+const DROPPED = /^error: Failed to load resource: net::ERR_NETWORK_CHANGED/;
+
 /** One tab, with its messages and requests. */
 export class Tab {
   constructor(page, address) {
@@ -170,9 +173,21 @@ export class Tab {
     await this.live();
   }
 
-  /** Waits for figures. */
+  /**
+   * Waits for figures. Chromium ends all requests when the host gets another interface or address, as
+   * hosts of tests do. A page that lacks a module for that is loaded again.
+   */
   async live() {
-    await this.page.locator('.status', { hasText: /live/ }).waitFor({ timeout: PATIENCE_MS });
+    const isDropped = (message) => DROPPED.test(message) && message.includes('/page/');
+    const lacksModule = async () => this.messages.some(isDropped)
+      && !await this.page.locator('main h1').count();
+    await until('figures', async () => {
+      if (await lacksModule()) {
+        this.messages = this.messages.filter((message) => !isDropped(message));
+        await this.page.reload();
+      }
+      return await this.page.locator('.status', { hasText: /live/ }).count() > 0;
+    });
     await this.page.locator('main h1').waitFor();
   }
 

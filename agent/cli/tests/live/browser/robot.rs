@@ -73,6 +73,20 @@ impl Place {
         self.host.outside().to_vec()
     }
 
+    /// Starts a subscriber of a topic of [`Self::publisher`].
+    pub(crate) fn subscriber(&self, topic: &str) -> Result<Process> {
+        let words = [
+            "--role",
+            "sub",
+            "--topic",
+            topic,
+            "--size",
+            "320",
+            "--best-effort",
+        ];
+        Process::start(&self.host.inside(), peer::robot()?, words)
+    }
+
     /// Starts a node that publishes its own topic until the returned value is dropped.
     pub(crate) fn publisher(&self, topic: &str, node: &str) -> Result<Process> {
         let words = ["--role", "pub", "--topic", topic, "--node", node];

@@ -578,9 +578,22 @@ fn a_finding_does_not_return_with_the_next_client() {
     observer.input(Input::InsideDetached);
     observer.input(Input::Time(Timestamp(START + 3600 * SECOND)));
     assert_eq!(late_findings(&mut observer, 3600), []);
-    report(&mut observer, 3601, 0);
+    let at = Timestamp(START + 3601 * SECOND);
+    let process = |id| ProcessReport {
+        id,
+        // Another finding, so that all are determined again.
+        is_suspended: id == 8,
+        ..ProcessReport::default()
+    };
+    observer.input(Input::Inside(Report {
+        at,
+        has_callbacks: true,
+        processes: [7, 8].map(process).into(),
+        ..Report::default()
+    }));
+    observer.input(Input::Time(at));
     assert_eq!(late_findings(&mut observer, 3601), []);
-    let facts = observer.snapshot(Timestamp(START + 3601 * SECOND)).inside;
+    let facts = observer.snapshot(at).inside;
     assert_eq!(facts.unwrap().late[0].calls, 3, "the calls are kept");
 }
 
