@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 
 use ros2probe_wire::Expansion;
 
-use super::mcap::Message;
+use super::mcap::{Channel, Message};
 use super::metadata::{self, File, Metadata, Topic};
 use super::open_file;
 use super::read::{self, Contents, ReadError};
@@ -200,18 +200,8 @@ pub(super) fn of_contents(contents: &Contents, path: &str) -> Metadata {
         .times
         .unwrap_or((metadata::NO_START, metadata::NO_START));
     let message_count = contents.messages();
-    let topics = contents.channels.values().map(|channel| {
-        let of_channel = |key: &str| channel.metadata.get(key).cloned().unwrap_or_default();
-        let schema = contents.schemas.get(&channel.schema_id);
-        Topic {
-            name: channel.topic.clone(),
-            type_name: schema.map(|schema| schema.name.clone()).unwrap_or_default(),
-            serialization_format: channel.message_encoding.clone(),
-            offered_qos_profiles: of_channel("offered_qos_profiles"),
-            type_description_hash: of_channel("topic_type_hash"),
-            message_count: contents.counts.get(&channel.id).copied().unwrap_or(0),
-        }
-    });
+    let topics = contents.channels.values();
+    let topics = topics.map(|channel| topic(contents, channel));
     let file = File {
         path: path.to_owned(),
         starting_time: start,
@@ -237,6 +227,20 @@ pub(super) fn of_contents(contents: &Contents, path: &str) -> Metadata {
             Some(stored) if !stored.ros_distro.is_empty() => stored.ros_distro,
             _ => ros_distro,
         },
+    }
+}
+
+/// Returns what a file says of a channel's topic.
+pub(super) fn topic(contents: &Contents, channel: &Channel) -> Topic {
+    let of_channel = |key: &str| channel.metadata.get(key).cloned().unwrap_or_default();
+    let schema = contents.schemas.get(&channel.schema_id);
+    Topic {
+        name: channel.topic.clone(),
+        type_name: schema.map(|schema| schema.name.clone()).unwrap_or_default(),
+        serialization_format: channel.message_encoding.clone(),
+        offered_qos_profiles: of_channel("offered_qos_profiles"),
+        type_description_hash: of_channel("topic_type_hash"),
+        message_count: contents.counts.get(&channel.id).copied().unwrap_or(0),
     }
 }
 

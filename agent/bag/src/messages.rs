@@ -14,7 +14,7 @@ use std::path::{Path, PathBuf};
 
 use ros2probe_wire::Expansion;
 
-use super::info::{SQLITE_MAGIC, read_text};
+use super::info::{self, SQLITE_MAGIC, read_text};
 use super::mcap;
 use super::metadata::{self, Metadata, MetadataError};
 use super::open_file;
@@ -122,6 +122,18 @@ pub struct Topic {
     pub type_description_hash: String,
 }
 
+impl From<metadata::Topic> for Topic {
+    fn from(topic: metadata::Topic) -> Self {
+        Self {
+            name: topic.name,
+            type_name: topic.type_name,
+            definition: String::new(),
+            offered_qos_profiles: topic.offered_qos_profiles,
+            type_description_hash: topic.type_description_hash,
+        }
+    }
+}
+
 /// Returns the topics of a bag that metadata.yaml and the summaries of its files describe, by name.
 /// A bag that was never completed describes none.
 #[must_use]
@@ -130,14 +142,7 @@ pub fn topics(path: &Path) -> Vec<Topic> {
     let metadata = read_text(&path.join(metadata::FILE_NAME)).ok();
     let metadata = metadata.and_then(|text| Metadata::read(&text).ok());
     for topic in metadata.into_iter().flat_map(|metadata| metadata.topics) {
-        let described = Topic {
-            name: topic.name.clone(),
-            type_name: topic.type_name,
-            definition: String::new(),
-            offered_qos_profiles: topic.offered_qos_profiles,
-            type_description_hash: topic.type_description_hash,
-        };
-        topics.insert(topic.name, described);
+        topics.insert(topic.name.clone(), Topic::from(topic));
     }
     let files = match path.is_dir() {
         true => files_of(path).map_or_else(|_| Vec::new(), |(files, _)| files),
@@ -148,18 +153,11 @@ pub fn topics(path: &Path) -> Vec<Topic> {
             continue;
         };
         for channel in contents.channels.values() {
-            let schema = contents.schemas.get(&channel.schema_id);
-            let entry = |key: &str| channel.metadata.get(key).cloned().unwrap_or_default();
             let described = topics
                 .entry(channel.topic.clone())
-                .or_insert_with(|| Topic {
-                    name: channel.topic.clone(),
-                    type_name: schema.map(|schema| schema.name.clone()).unwrap_or_default(),
-                    definition: String::new(),
-                    offered_qos_profiles: entry("offered_qos_profiles"),
-                    type_description_hash: entry("topic_type_hash"),
-                });
+                .or_insert_with(|| info::topic(&contents, channel).into());
             if described.definition.is_empty() {
+                let schema = contents.schemas.get(&channel.schema_id);
                 let definition = schema.and_then(definition_of);
                 described.definition = definition.unwrap_or_default().to_owned();
             }

@@ -3,14 +3,13 @@
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
 
-use ros2probe_testing::local_agent::{LocalAgent, PATIENCE, call_api};
+use ros2probe_testing::local_agent::{LocalAgent, call_api};
 use ros2probe_testing::repository;
-use serde_json::{Value, json};
+use serde_json::json;
 
 use crate::bag_chains::{CAPTURE, converted, recorded, sqlite3};
-use crate::page::get;
+use crate::replay::wait_for;
 use crate::ros2::{run, stderr, stdout};
 use crate::rp;
 
@@ -165,19 +164,6 @@ fn messages_that_are_not_cdr_are_skipped_and_counted() {
     assert!(said.contains("10 messages skipped"), "{said}");
 }
 
-/// Returns the replay once it is as wanted.
-fn wait_for(agent: &LocalAgent, is_wanted: impl Fn(&Value) -> bool) -> Value {
-    let deadline = Instant::now() + PATIENCE;
-    loop {
-        let replay = get(agent, "/replay");
-        if is_wanted(&replay) {
-            return replay;
-        }
-        assert!(Instant::now() < deadline, "{replay}");
-        std::thread::sleep(Duration::from_millis(50));
-    }
-}
-
 #[test]
 fn the_bag_of_an_incident_pauses_at_its_trigger() {
     let directory = tempfile::tempdir().unwrap();
@@ -199,7 +185,7 @@ fn the_bag_of_an_incident_pauses_at_its_trigger() {
     )
     .unwrap();
     let agent = LocalAgent::replay(&mut rp(), &bag, &["--watch", "/**"]);
-    let paused = wait_for(&agent, |replay| {
+    let paused = wait_for(&agent, "paused", |replay| {
         replay["is_paused"] == true && replay["is_jumping"] == false
     });
     let at = paused["timestamp_seconds"].as_f64().unwrap();
@@ -207,5 +193,5 @@ fn the_bag_of_an_incident_pauses_at_its_trigger() {
     let change = json!({"is_paused": false, "speed": 0}).to_string();
     let (status, _) = call_api(agent.api, "POST", "/replay", &change);
     assert_eq!(status, 200);
-    wait_for(&agent, |replay| replay["is_finished"] == true);
+    wait_for(&agent, "finished", |replay| replay["is_finished"] == true);
 }

@@ -57,6 +57,16 @@ pub(crate) fn make_certificate(directory: &Path) {
     make("/CN=collector", "key", "certificate", &signed);
 }
 
+/// Creates the files of [`make_certificate`], and returns the configuration of a server that presents
+/// the certificate.
+pub(crate) fn make_server_config(directory: &Path) -> ServerConfig {
+    make_certificate(directory);
+    let certificate = CertificateDer::from_pem_file(directory.join("certificate")).unwrap();
+    let key = PrivateKeyDer::from_pem_file(directory.join("key")).unwrap();
+    let config = ServerConfig::builder().with_no_client_auth();
+    config.with_single_cert(vec![certificate], key).unwrap()
+}
+
 /// Asserts that exports to the receiver at this port succeed only with its authority.
 fn assert_believed_if_known(directory: &Path, port: u16, protocol: &str) {
     let path = |name: &str| directory.join(name).to_str().unwrap().to_owned();
@@ -117,11 +127,7 @@ async fn only_a_receiver_with_a_known_authority_gets_exports() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn only_a_receiver_with_a_known_authority_gets_exports_over_http() {
     let directory = tempfile::tempdir().unwrap();
-    make_certificate(directory.path());
-    let certificate = CertificateDer::from_pem_file(directory.path().join("certificate")).unwrap();
-    let key = PrivateKeyDer::from_pem_file(directory.path().join("key")).unwrap();
-    let config = ServerConfig::builder().with_no_client_auth();
-    let config = config.with_single_cert(vec![certificate], key).unwrap();
+    let config = make_server_config(directory.path());
     let acceptor = TlsAcceptor::from(Arc::new(config));
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let port = listener.local_addr().unwrap().port();

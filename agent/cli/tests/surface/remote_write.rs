@@ -15,7 +15,7 @@ use tokio_rustls::rustls::server::WebPkiClientVerifier;
 use tokio_rustls::rustls::{RootCertStore, ServerConfig};
 
 use crate::otlp::changes;
-use crate::otlp_tls::make_certificate;
+use crate::otlp_tls::{make_certificate, make_server_config};
 use crate::rp;
 
 /// Value of a series that ended.
@@ -396,11 +396,7 @@ fn a_receiver_that_demands_certificates_accepts_a_renewed_one() {
 fn a_damaged_replaced_file_is_logged_once_and_stops_no_samples() {
     let directory = tempfile::tempdir().unwrap();
     let path = |name: &str| directory.path().join(name);
-    make_certificate(directory.path());
-    let certificate = CertificateDer::from_pem_file(path("certificate")).unwrap();
-    let key = PrivateKeyDer::from_pem_file(path("key")).unwrap();
-    let config = ServerConfig::builder().with_no_client_auth();
-    let config = config.with_single_cert(vec![certificate], key).unwrap();
+    let config = make_server_config(directory.path());
     let receiver = Receiver::start_tls(config, Reply::stored);
     std::fs::copy(path("authority"), path("robot.authority")).unwrap();
     let more = format!(", ca_file: {}", path("robot.authority").display());

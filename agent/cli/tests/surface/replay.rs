@@ -9,7 +9,11 @@ use ros2probe_testing::local_agent::{LocalAgent, PATIENCE, call_api};
 use serde_json::{Value, json};
 
 /// Returns the replay once it is as wanted.
-fn wait_for(agent: &LocalAgent, what: &str, is_wanted: impl Fn(&Value) -> bool) -> Value {
+pub(crate) fn wait_for(
+    agent: &LocalAgent,
+    what: &str,
+    is_wanted: impl Fn(&Value) -> bool,
+) -> Value {
     let deadline = Instant::now() + PATIENCE;
     loop {
         let replay = get(agent, "/replay");

@@ -6,13 +6,11 @@ use std::path::{Path, PathBuf};
 use std::process::Output;
 use std::sync::Arc;
 
-use crate::otlp_tls::make_certificate;
+use crate::otlp_tls::make_server_config;
 use crate::rp;
 use ros2probe_testing::local_agent::LocalAgent;
 use serde_json::{Value, json};
-use tokio_rustls::rustls::pki_types::pem::PemObject as _;
-use tokio_rustls::rustls::pki_types::{CertificateDer, PrivateKeyDer};
-use tokio_rustls::rustls::{ServerConfig, ServerConnection, StreamOwned};
+use tokio_rustls::rustls::{ServerConnection, StreamOwned};
 
 const OWN: &str = env!("CARGO_PKG_VERSION");
 
@@ -164,12 +162,7 @@ fn a_feed_at_an_address_is_read_once_with_its_redirections() {
 fn a_feed_over_https_needs_a_certificate_of_a_known_authority() {
     let directory = tempfile::tempdir().unwrap();
     let path = |name: &str| directory.path().join(name);
-    make_certificate(directory.path());
-    let certificate = CertificateDer::from_pem_file(path("certificate")).unwrap();
-    let key = PrivateKeyDer::from_pem_file(path("key")).unwrap();
-    let config = ServerConfig::builder().with_no_client_auth();
-    let config = config.with_single_cert(vec![certificate], key).unwrap();
-    let config = Arc::new(config);
+    let config = Arc::new(make_server_config(directory.path()));
     let port = serve(move |stream| {
         let connection = ServerConnection::new(Arc::clone(&config)).unwrap();
         answer(StreamOwned::new(connection, stream));

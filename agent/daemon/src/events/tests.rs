@@ -1,10 +1,10 @@
 //! Log of events under bursts, slow readers and restarts.
 
-use ros2probe_wire::{DomainId, Guid};
+use ros2probe_wire::{DomainId, Guid, SequenceNumber};
 
 use super::*;
 use ros2probe_model::facts::churn;
-use ros2probe_model::facts::event::{Event, EventKind};
+use ros2probe_model::facts::event::{Event, EventKind, LossBurst};
 use ros2probe_model::report::snapshot::WatchState;
 
 fn node(at: u64) -> Event {
@@ -27,6 +27,21 @@ fn taken(events: Vec<Event>) -> Taken {
 /// Returns the time at the start of a second of the clock.
 const fn second(number: u64) -> Timestamp {
     Timestamp(number * SECOND)
+}
+
+impl EventLog {
+    /// Records that messages were lost, when the source's time is `clock`.
+    pub(crate) fn lose_messages(&self, count: u64, at: Timestamp, clock: Timestamp) {
+        let kind = EventKind::Loss(LossBurst {
+            writer: Guid::default(),
+            topic: None,
+            node: None,
+            count,
+            first: SequenceNumber(1),
+            last: SequenceNumber(count),
+        });
+        self.add(taken(vec![Event { at, kind }]), clock);
+    }
 }
 
 fn names(batch: &Batch) -> Vec<&'static str> {

@@ -630,36 +630,39 @@ mod tests {
     use crate::config::Limits;
     use crate::subscriptions::Caps;
 
-    fn recordings(directory: &Path) -> Recordings {
-        let latest = Arc::new(SnapshotCell::new(SourceKind::Wire));
-        let caps = Caps {
-            subscriptions: 4,
-            bytes: 1 << 20,
-        };
-        let stop = CancellationToken::new();
-        let subscriptions = Arc::new(Subscriptions::new(Arc::clone(&latest), caps, stop));
-        Recordings::new(Components {
-            directory: Some(directory.to_owned()),
-            limits: RecordingLimits {
-                reserve_percent: 0,
-                reserve_bytes: 0,
-                ..RecordingLimits::default()
-            },
-            queue_bytes: 1 << 20,
-            latest,
-            events: Arc::new(EventLog::new()),
-            caps: Arc::new(LimitFigures::new(Limits::default())),
-            figures: Arc::new(RecordingFigures::default()),
-            subscriptions,
-            library: Arc::new(Library::new(LibrarySources::default())),
-            receipts: None,
-        })
+    impl Components {
+        /// Returns the parts of an agent without messages, which records into this directory.
+        pub(crate) fn in_directory(directory: &Path) -> Self {
+            let latest = Arc::new(SnapshotCell::new(SourceKind::Wire));
+            let caps = Caps {
+                subscriptions: 4,
+                bytes: 1 << 20,
+            };
+            let stop = CancellationToken::new();
+            let subscriptions = Arc::new(Subscriptions::new(Arc::clone(&latest), caps, stop));
+            Self {
+                directory: Some(directory.to_owned()),
+                limits: RecordingLimits {
+                    reserve_percent: 0,
+                    reserve_bytes: 0,
+                    ..RecordingLimits::default()
+                },
+                queue_bytes: 1 << 20,
+                latest,
+                events: Arc::new(EventLog::new()),
+                caps: Arc::new(LimitFigures::new(Limits::default())),
+                figures: Arc::new(RecordingFigures::default()),
+                subscriptions,
+                library: Arc::new(Library::new(LibrarySources::default())),
+                receipts: None,
+            }
+        }
     }
 
     #[test]
     fn recordings_are_listed_while_the_storage_of_a_new_one_is_slow() {
         let directory = tempfile::tempdir().unwrap();
-        let recordings = recordings(directory.path());
+        let recordings = Recordings::new(Components::in_directory(directory.path()));
         let wanted = RecordingOptions {
             name: Some("slow".to_owned()),
             requested: FilterOptions::everything(),

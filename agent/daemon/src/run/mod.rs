@@ -348,7 +348,6 @@ impl Run {
             return false;
         };
         let has_arrived = match followed.jump {
-            // A request that came since then may lead back.
             Some(Jump::To(_)) => replay.has_reached_target(),
             Some(Jump::NextEvent) => has_event || replay.has_reached_target(),
             None => false,

@@ -138,7 +138,7 @@ pub struct Replay {
     limits: Limits,
     /// What triggered the bag of a snapshot, and its time.
     incident: Option<(Timestamp, BagTrigger)>,
-    packets_read: Packets,
+    file: Packets,
     decoder: FrameDecoder,
     pacer: Pacer,
     /// Speed at the start, and now.
@@ -205,7 +205,7 @@ impl Replay {
                 let time = u64::try_from(time.as_nanosecond()).ok()?;
                 Some((Timestamp(time), bag.trigger))
             }),
-            packets_read: Packets::open(path, expansion)?,
+            file: Packets::open(path, expansion)?,
             decoder: FrameDecoder::new(limits),
             pacer: Pacer::new(speed),
             started_speed: speed,
@@ -232,7 +232,7 @@ impl Replay {
     ///
     /// Fails if the file cannot be opened again. The replay then stays as it is.
     pub(super) fn begin_again(&mut self) -> Result<(), ReplayError> {
-        self.packets_read = Packets::open(&self.path, self.expansion)?;
+        self.file = Packets::open(&self.path, self.expansion)?;
         self.decoder = FrameDecoder::new(self.limits);
         self.pacer = Pacer::new(self.speed);
         (self.waiting, self.clock) = (None, self.began.unwrap_or_default());
@@ -380,7 +380,7 @@ impl Replay {
     fn next(&mut self) -> Result<(), ReplayError> {
         let memory = self.waiting.take().map(|waiting| waiting.bytes);
         let memory = memory.unwrap_or_default();
-        let next = match &mut self.packets_read {
+        let next = match &mut self.file {
             Packets::Capture(reader) => next_frame(reader, memory).map_err(ReplayError::from),
             Packets::Bag(reader) => next_message(reader, memory).map_err(ReplayError::from),
         };
@@ -506,7 +506,7 @@ impl Replay {
         if self.finished {
             return Some(1.0);
         }
-        match &self.packets_read {
+        match &self.file {
             Packets::Capture(reader) => reader.part_read(),
             Packets::Bag(reader) => reader.part_read(),
         }
@@ -516,7 +516,7 @@ impl Replay {
     /// the end.
     #[must_use]
     pub fn faults(&self) -> Vec<String> {
-        match &self.packets_read {
+        match &self.file {
             Packets::Capture(_) => Vec::new(),
             Packets::Bag(reader) => reader.faults(),
         }
@@ -524,7 +524,7 @@ impl Replay {
 
     /// Returns definitions of types in a bag that were not returned yet.
     pub(super) fn take_definitions(&mut self) -> Vec<MessageType> {
-        match &mut self.packets_read {
+        match &mut self.file {
             Packets::Capture(_) => Vec::new(),
             Packets::Bag(reader) => reader.take_definitions(),
         }
@@ -563,7 +563,7 @@ impl Replay {
             self.progress = Some(Instant::now());
             let seconds =
                 self.clock.nanoseconds_since(self.began.unwrap_or_default()) / 1_000_000_000;
-            let (packets, whole) = match self.packets_read {
+            let (packets, whole) = match self.file {
                 Packets::Capture(_) => ("packets", "capture"),
                 Packets::Bag(_) => ("messages", "bag"),
             };

@@ -240,7 +240,7 @@ impl TopicEvaluation {
             return if is_late { MAX_LATENCY } else { 0 };
         }
         if evidence.publishers == 0 || evidence.subscriptions == 0 {
-            // Nothing is sent any more.
+            // No further message can be late.
             self.late = 0;
         }
         match self.late >= EVALUATIONS_TO_VIOLATE {

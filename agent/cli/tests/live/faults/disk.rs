@@ -124,7 +124,7 @@ fn a_full_read_only_or_removed_disk_loses_only_its_files_and_no_message() -> Res
         place.display()
     );
     let script =
-        r#"mount -t tmpfs -o size=3m none "$0" && mkdir "$0/state" "$0/bags" && exec "$@""#;
+        r#"mount -t tmpfs -o size=24m none "$0" && mkdir "$0/state" "$0/bags" && exec "$@""#;
     let place_name = place.display().to_string();
     let words = ["unshare", "--mount", "sh", "-c", script, &place_name];
     let scene = FaultBench::start(&link.robot, &directory, &configuration, &words)?;

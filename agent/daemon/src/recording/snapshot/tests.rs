@@ -6,31 +6,26 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use ros2probe_bag::metadata::{self, Metadata};
-use ros2probe_message::{Library, Sources};
 use ros2probe_model::facts::calls::facts::Owner;
 use ros2probe_model::facts::calls::report as inside;
 use ros2probe_model::facts::calls::{late, other_thread};
 use ros2probe_model::facts::churn;
 use ros2probe_model::facts::diagnosis::{Diagnosis, TopicKey};
 use ros2probe_model::facts::dispatch::Sample;
-use ros2probe_model::facts::event::{Event, EventKind, LossBurst, Taken};
+use ros2probe_model::facts::event::{Event, EventKind, Taken};
 use ros2probe_model::facts::topic_kind::TopicKind;
 use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{DomainId, Expansion, Guid, SequenceNumber, Timestamp};
 use tempfile::TempDir;
-use tokio_util::sync::CancellationToken;
 
 use super::bag::{Cause, TriggeredBag};
 use super::task::SnapshotTask;
-use crate::agent_facts::SourceKind;
-use crate::config::{Limits, RecordingLimits, SnapshotSettings};
+use crate::config::SnapshotSettings;
 use crate::events::{EventLog, Trigger};
-use crate::limit_facts::LimitFigures;
 use crate::recording::service::{Components, Recordings};
 use crate::recording::{RecordingFigures, SnapshotFigures};
-use crate::snapshot_cell::SnapshotCell;
-use crate::subscriptions::{Caps, Item, Missed, MissedReason, Subscriptions, Topic};
+use crate::subscriptions::{Item, Missed, MissedReason, Topic};
 
 const TENTH: u64 = SECOND / 10;
 
@@ -70,31 +65,15 @@ impl Robot {
 
     fn with_receipts(settings: SnapshotSettings, receipts: Option<&Path>) -> Self {
         let directory = tempfile::tempdir().unwrap();
-        let latest = Arc::new(SnapshotCell::new(SourceKind::Wire));
-        let caps = Caps {
-            subscriptions: 4,
-            bytes: 1 << 20,
-        };
-        let stop = CancellationToken::new();
-        let subscriptions = Arc::new(Subscriptions::new(Arc::clone(&latest), caps, stop));
-        let events = Arc::new(EventLog::new());
-        let figures = Arc::new(RecordingFigures::default());
-        let recordings = Recordings::new(Components {
-            directory: Some(directory.path().to_owned()),
-            limits: RecordingLimits {
-                reserve_percent: 0,
-                reserve_bytes: 0,
-                ..RecordingLimits::default()
-            },
-            queue_bytes: 1 << 20,
-            latest,
-            events: Arc::clone(&events),
-            caps: Arc::new(LimitFigures::new(Limits::default())),
-            figures: Arc::clone(&figures),
-            subscriptions,
-            library: Arc::new(Library::new(Sources::default())),
+        let components = Components {
             receipts: receipts.map(Path::to_owned),
-        });
+            ..Components::in_directory(directory.path())
+        };
+        let (events, figures) = (
+            Arc::clone(&components.events),
+            Arc::clone(&components.figures),
+        );
+        let recordings = Recordings::new(components);
         let topic = Topic {
             domain_id: DomainId(0),
             name: "/imu".into(),
@@ -151,14 +130,7 @@ impl Robot {
     }
 
     fn lose_messages(&self) {
-        self.event(EventKind::Loss(LossBurst {
-            writer: Guid::default(),
-            topic: None,
-            node: None,
-            count: 3,
-            first: SequenceNumber(1),
-            last: SequenceNumber(3),
-        }));
+        self.events.lose_messages(3, self.time(), self.time());
     }
 
     fn lose_participant(&self, change: churn::Event, domain: u32) {
@@ -340,17 +312,7 @@ fn a_late_event_does_not_shorten_the_time_before_the_incident() {
     let incident = robot.time();
     let number = robot.now;
     robot.run(15);
-    let kind = EventKind::Loss(LossBurst {
-        writer: Guid::default(),
-        topic: None,
-        node: None,
-        count: 1,
-        first: SequenceNumber(1),
-        last: SequenceNumber(1),
-    });
-    let events = vec![Event { at: incident, kind }];
-    let overflow = Vec::new();
-    robot.events.add(Taken { events, overflow }, robot.time());
+    robot.events.lose_messages(1, incident, robot.time());
     robot.run(30);
     let expected: Vec<u64> = (number - 30..=number + 20).collect();
     assert_eq!(robot.only_bag(), expected);

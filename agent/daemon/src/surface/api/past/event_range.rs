@@ -1,7 +1,7 @@
 //! The events of a time: those of the blocks on disk, and those of the log that are in no block
 //! yet.
 
-use std::collections::HashSet;
+use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
 
 use jiff::Timestamp;
@@ -20,8 +20,8 @@ pub(super) struct EventRange<'a> {
     log: &'a EventLog,
     /// Unix times in whole seconds.
     times: RangeInclusive<i64>,
-    /// Numbers of the events of this run in the visited blocks.
-    written: HashSet<u64>,
+    /// Lines of the events in the log that no visited block has, by number.
+    unwritten: BTreeMap<u64, Vec<u8>>,
 }
 
 /// The part of a line that is compared.
@@ -32,11 +32,30 @@ struct EventHead<'a> {
 }
 
 impl<'a> EventRange<'a> {
+    /// Selects the events of a time from the log of now, and from the blocks that follow.
     pub(super) fn new(log: &'a EventLog, times: Times) -> Self {
+        let times: RangeInclusive<i64> = times.from.into()..=times.to.into();
+        let mut unwritten = BTreeMap::new();
+        let mut place = 0;
+        loop {
+            let batch = log.read(place, LOG_BATCH);
+            if batch.records.is_empty() {
+                break;
+            }
+            place = batch.last;
+            for record in &batch.records {
+                let second = i64::try_from(record.at.whole_seconds()).unwrap_or(i64::MAX);
+                if times.contains(&second) {
+                    let mut line = Vec::new();
+                    write_line(&mut line, &event(log, record));
+                    unwritten.insert(record.number, line);
+                }
+            }
+        }
         Self {
             log,
-            times: times.from.into()..=times.to.into(),
-            written: HashSet::new(),
+            times,
+            unwritten,
         }
     }
 
@@ -48,7 +67,7 @@ impl<'a> EventRange<'a> {
                 continue;
             };
             if let Some(Position::After(number)) = self.log.position(head.id) {
-                self.written.insert(number);
+                self.unwritten.remove(&number);
             }
             let time = head.time.parse::<Timestamp>();
             if time.is_ok_and(|time| self.times.contains(&time.as_second())) {
@@ -59,47 +78,17 @@ impl<'a> EventRange<'a> {
     }
 
     /// Returns the lines of the events that the visited blocks do not have.
-    pub(super) fn unwritten(&self) -> Vec<u8> {
-        let mut selected = Vec::new();
-        let mut place = 0;
-        loop {
-            let batch = self.log.read(place, LOG_BATCH);
-            if batch.records.is_empty() {
-                return selected;
-            }
-            place = batch.last;
-            for record in &batch.records {
-                let second = i64::try_from(record.at.whole_seconds()).unwrap_or(i64::MAX);
-                if self.times.contains(&second) && !self.written.contains(&record.number) {
-                    write_line(&mut selected, &event(self.log, record));
-                }
-            }
-        }
+    pub(super) fn unwritten(self) -> Vec<u8> {
+        self.unwritten.into_values().flatten().collect()
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use ros2probe_model::facts::event::{Event, EventKind, LossBurst, Taken};
+    use ros2probe_wire::Timestamp as WireTimestamp;
     use ros2probe_wire::time::SECOND;
-    use ros2probe_wire::{Guid, SequenceNumber, Timestamp as WireTimestamp};
 
     use super::*;
-
-    fn lose_message(log: &EventLog, second: u64) {
-        let at = WireTimestamp(second * SECOND);
-        let kind = EventKind::Loss(LossBurst {
-            writer: Guid::default(),
-            topic: None,
-            node: None,
-            count: 1,
-            first: SequenceNumber(1),
-            last: SequenceNumber(1),
-        });
-        let events = vec![Event { at, kind }];
-        let overflow = Vec::new();
-        log.add(Taken { events, overflow }, at);
-    }
 
     /// Returns the times of the events in lines.
     fn times(lines: &[u8]) -> Vec<String> {
@@ -115,7 +104,8 @@ mod tests {
     fn events_of_a_time_include_those_that_are_not_on_disk_yet_and_no_others() {
         let log = EventLog::new();
         for second in [10, 20, 30, 40, 50] {
-            lose_message(&log, second);
+            let at = WireTimestamp(second * SECOND);
+            log.lose_messages(1, at, at);
         }
         let mut block = Vec::new();
         for record in &log.read(0, 3).records {

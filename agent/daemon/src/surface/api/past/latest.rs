@@ -51,9 +51,9 @@ impl LatestProcesses {
 
 impl LatestEvents {
     /// Adds the next block of lines.
-    pub(super) fn add(&mut self, lines: &[u8]) {
+    pub(super) fn add(&mut self, lines: Vec<u8>) {
         self.bytes += lines.len();
-        self.blocks.push_back(lines.to_vec());
+        self.blocks.push_back(lines);
         while self.bytes > MAX_EVENT_BYTES
             && let Some(first) = self.blocks.pop_front()
         {
@@ -115,11 +115,11 @@ mod tests {
         let block = |letter: char, length: usize| letter.to_string().repeat(length);
         let half = MAX_EVENT_BYTES / 2;
         for (letter, length) in [('a', 10), ('b', half), ('c', half - 10)] {
-            latest.add(block(letter, length).as_bytes());
+            latest.add(block(letter, length).into_bytes());
         }
         assert!(!latest.is_truncated());
-        latest.add(block('d', 11).as_bytes());
-        latest.add(block('e', 1).as_bytes());
+        latest.add(block('d', 11).into_bytes());
+        latest.add(block('e', 1).into_bytes());
         assert!(latest.is_truncated());
         let lines = String::from_utf8(latest.into_lines()).unwrap();
         assert_eq!(lines.len(), half + 2);

@@ -211,9 +211,9 @@ async fn events(
         let mut latest = LatestEvents::default();
         let mut selected = EventRange::new(&log, range);
         store.events(range.times(), &mut |lines| {
-            latest.add(&selected.of_block(lines));
+            latest.add(selected.of_block(lines));
         });
-        latest.add(&selected.unwritten());
+        latest.add(selected.unwritten());
         latest
     });
     let (latest, _permit) = read.await?;

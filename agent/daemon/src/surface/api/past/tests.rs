@@ -10,34 +10,32 @@ use axum::http::{Request, StatusCode, Uri};
 use hyper::service::Service as _;
 use hyper_util::service::TowerToHyperService;
 use ros2probe_api::doctor::{Report, Severity};
+use ros2probe_capture::reassembly::Limits;
 use ros2probe_message::{Library, Sources};
+use ros2probe_model::observe::observer::{self, Observer};
+use ros2probe_testing::repository;
 use tokio_util::sync::CancellationToken;
 
-use super::super::reload;
 use super::super::security::Rights;
-use super::super::{Context, Doctor, Live, Page, nouns};
+use super::super::{Context, Doctor, nouns};
 use super::query::{MAX_READERS, READER_PERMITS};
+use crate::agent::{Components, Expansion, Speed};
 use crate::agent_facts::SourceKind;
 use crate::config::{Access, Config};
-use crate::recording::{self, Recordings, Snapshots};
+use crate::run::Source;
+use crate::run::replay::Replay;
 use crate::settings_cell::Settings;
-use crate::subscriptions::{Caps, Subscriptions};
 use crate::surface::MetricSources;
 use crate::watches::Watches;
 
 /// Returns the context of an agent with a history in this directory.
 fn context(directory: &Path) -> Context {
     let config = Config::default();
+    let capture = repository("wire/tests/data/cyclonedds-samehost-any.pcap.gz");
+    let limits = Limits::default();
+    let replay = Replay::open(&capture, Expansion::Limited, Speed::Max, limits).unwrap();
     let sources = MetricSources::new(SourceKind::Replay, Settings::new(&config));
     sources.disk_history.keep_in(directory, 1 << 20);
-    let stop = CancellationToken::new();
-    let caps = Caps {
-        subscriptions: 1,
-        bytes: 1 << 20,
-    };
-    let subscriptions = Subscriptions::new(Arc::clone(&sources.latest), caps, stop.clone());
-    let subscriptions = Arc::new(subscriptions);
-    let library = Arc::new(Library::new(Sources::default()));
     let watches = Watches::new(
         Arc::clone(&sources.limits),
         Arc::clone(&sources.events),
@@ -46,43 +44,30 @@ fn context(directory: &Path) -> Context {
         Vec::new(),
         Vec::new(),
     );
-    let recordings = Recordings::new(recording::Components {
-        directory: None,
-        limits: config.recordings.limits,
-        queue_bytes: 1 << 20,
-        latest: Arc::clone(&sources.latest),
-        events: Arc::clone(&sources.events),
-        caps: Arc::clone(&sources.limits),
-        figures: Arc::clone(&sources.recordings),
-        subscriptions: Arc::clone(&subscriptions),
-        library: Arc::clone(&library),
-        receipts: None,
-    });
-    let (reloader, _) = reload::channel();
-    Context {
-        latest: sources.latest,
-        events: sources.events,
-        limits: sources.limits,
-        recording_figures: sources.recordings,
+    let components = Components {
+        config: &config,
+        source: Source::Replay(Box::new(replay)),
+        observer: Observer::new(observer::Settings::default()),
+        sources,
+        spans: Arc::default(),
+        node_logs: Arc::default(),
         watches: Arc::new(watches.unwrap()),
-        subscriptions,
-        recordings: Arc::new(recordings),
-        snapshots: Arc::new(Snapshots::default()),
-        live: Arc::new(Live::new(Duration::ZERO)),
-        disk_history: sources.disk_history,
-        library,
-        viewers: sources.viewers,
-        ros2_daemon: sources.ros2_daemon,
-        page: Arc::new(Page::new(Vec::new())),
+        state_writer: None,
+        recordings: None,
+        receipts: None,
+        library: Arc::new(Library::new(Sources::default())),
+        history: Duration::ZERO,
+        restart: None,
+        addresses: Vec::new(),
         doctor: Doctor::new(|_| Report {
             version: "".into(),
             subject: String::new(),
             severity: Severity::Ok,
             findings: Vec::new(),
         }),
-        reloader,
-        stop,
-    }
+        stop: CancellationToken::new(),
+    };
+    components.assemble().unwrap().context
 }
 
 /// Earlier, two such requests held the permits of all large answers for ten seconds.
