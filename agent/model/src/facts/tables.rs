@@ -359,6 +359,8 @@ crate::tables! {
     LatestStamps { name: "chains.latest.stamps", entries: 4, rule: Oldest }
     /// Unknown writers
     UnknownWriters { name: "unknown_writers", entries: CONFIGURED }
+    /// Latest observations of unknown writers
+    LatestUnknown { name: "unknown_writers.latest", entries: 256, rule: Oldest, effect: "is not counted for subscribers" }
     /// Samples of one writer that wait for lower numbers
     OrderedSamples { name: "in_order.waiting", entries: 4097, effect: "the lower numbers are given up" }
     /// Sample numbers of one writer that is not announced yet

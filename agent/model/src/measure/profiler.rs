@@ -5,7 +5,7 @@
 
 mod unknown_writers;
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeSet, VecDeque};
 use std::time::Duration;
 
 use foldhash::{HashMap, HashMapExt as _};
@@ -89,6 +89,8 @@ pub struct Measured {
 pub struct Profiler {
     writers: HashMap<Guid, Measured>,
     unknown_writers: Bounded<bounded::Counted<tables::UnknownWriters>, BTreeSet<Guid>>,
+    /// The latest observations of unknown writers.
+    latest_unknown: Bounded<tables::LatestUnknown, VecDeque<Observation>>,
     shared: SharedBudgets,
     search_after: ModelTime,
     /// No writer is due before this time.
@@ -146,6 +148,7 @@ impl Profiler {
         Self {
             writers: HashMap::new(),
             unknown_writers: Bounded::capped(unknown_writer_limit),
+            latest_unknown: Bounded::default(),
             shared: SharedBudgets {
                 budget: Budget::new(sample_bytes),
                 unknown_writers_budget: Budget::new(sample_bytes / UNKNOWN_WRITERS_SHARE),
@@ -254,7 +257,9 @@ impl Profiler {
             head.path,
             Path::SharedMemory { .. } | Path::Stream { relayed: true, .. }
         );
-        if measured.topic.is_some() && is_delivery {
+        if measured.topic.is_none() && is_delivery {
+            self.latest_unknown.add(*observation);
+        } else if is_delivery {
             let mut context = self.shared.writer_context(writer_ref, now, journal, graph);
             let subscribers = measured
                 .subscribers
@@ -317,7 +322,7 @@ impl Profiler {
     }
 
     /// Begins to measure a writer with a topic, and keeps its measurements from before the
-    /// announcement.
+    /// announcement. Returns whether it was an unknown writer.
     pub fn measure(
         &mut self,
         guid: Guid,
@@ -325,12 +330,13 @@ impl Profiler {
         traits: Traits,
         opened: ModelTime,
         now: ModelTime,
-    ) {
+    ) -> bool {
         if let Some(known) = self.writers.get_mut(&guid) {
             (known.due, self.earliest) = (ModelTime::ZERO, ModelTime::ZERO);
             known.writer.learn(traits);
             known.opened = known.opened.max(opened);
-            if known.topic.is_none() {
+            let was_unknown = known.topic.is_none();
+            if was_unknown {
                 known.opened = known.opened.max(now);
                 known.writer.begin_window(now);
                 // The other budget accounts for its unfinished samples from now on.
@@ -342,12 +348,13 @@ impl Profiler {
                 known.allow_incomplete(now);
             }
             known.topic = Some(topic);
-            return;
+            return was_unknown;
         }
         let mut measured = Measured::new(Writer::new(guid, traits), Some(topic), now);
         measured.opened = opened;
         measured.allow_incomplete(now);
         self.writers.insert(guid, measured);
+        false
     }
 
     /// Replaces the GUID of an unknown writer by the announced one.

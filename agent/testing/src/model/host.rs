@@ -93,6 +93,17 @@ impl Host {
 
     /// Creates a host with a reliable writer of Alice's on `/chatter`.
     pub fn with(settings: Settings) -> Self {
+        let mut host = Self::unannounced_with(settings);
+        host.writer(true);
+        host
+    }
+
+    /// Creates a host with Alice's participant, which has not announced its writer.
+    pub fn unannounced() -> Self {
+        Self::unannounced_with(Settings::default())
+    }
+
+    fn unannounced_with(settings: Settings) -> Self {
         let mut observer = Observer::new(settings);
         observer.input(Input::Watchlist(Arc::new(
             Watchlist::new(vec![Watch::named("/**").unwrap()]).unwrap(),
@@ -103,7 +114,6 @@ impl Host {
             now: START,
         };
         host.participant(ALICE, "10.0.0.1:7411".parse().unwrap());
-        host.writer(true);
         host
     }
 

@@ -15,6 +15,7 @@ use crate::facts::journal::Journal;
 use crate::facts::model_time::ModelTime;
 use crate::facts::observation::Observation;
 use crate::measure::receivers::Graph;
+use crate::measure::subscribers::Subscribers;
 use crate::measure::writer::{Traits, Writer};
 
 /// Minimum time between two searches for writers to evict.
@@ -69,6 +70,41 @@ impl Profiler {
         measured.has_participant = participants.contains_key(&guid.prefix);
         self.writers.insert(guid, measured);
         self.observe(observation, journal, graph)
+    }
+
+    /// Counts for its subscribers what a writer sent shortly before its announcement, and after
+    /// `since`. HDDS announces a writer to a new participant while it already sends its history
+    /// there.
+    pub fn deliver_earlier(
+        &mut self,
+        guid: Guid,
+        (since, now): (ModelTime, ModelTime),
+        journal: &mut Journal,
+        graph: &Graph,
+    ) {
+        let Some(measured) = self.writers.get_mut(&guid) else {
+            return;
+        };
+        let since = since.max(now - UNKNOWN_AFTER);
+        let writer_ref = measured.writer_ref(guid);
+        for observation in self.latest_unknown.take() {
+            let head = observation.head();
+            if head.writer != guid {
+                self.latest_unknown.add(observation);
+            } else if head.at >= since {
+                let subscribers = measured
+                    .subscribers
+                    .get_or_insert_with(|| Box::new(Subscribers::new(measured.complete_from)));
+                let context = &mut self
+                    .shared
+                    .writer_context(writer_ref, head.at, journal, graph);
+                subscribers.observe(&observation, context);
+            }
+        }
+        // The kernel filter may have omitted some of it.
+        if let Some(subscribers) = &mut measured.subscribers {
+            subscribers.skip_numbers(now);
+        }
     }
 
     /// Drops the unknown writer with the longest silence that is not established. Returns whether

@@ -1,8 +1,8 @@
 //! Only a reader that matches the writer makes a process a subscriber.
 
 use ros2probe_model::observe::input::Input;
-use ros2probe_model::report::snapshot::SocketFacts;
-use ros2probe_testing::model::host::{BOB, CAROL, CapturePoint, Host};
+use ros2probe_model::report::snapshot::{Direction, SocketFacts};
+use ros2probe_testing::model::host::{BOB, CAROL, CapturePoint, GROUP, Host};
 use ros2probe_wire::record::{flag, kind};
 use ros2probe_wire::{GuidPrefix, Record};
 
@@ -108,6 +108,51 @@ fn counts_of_a_socket_appear_once_its_participant_is_known_as_a_reader() {
             assert_eq!((sum.messages, sum.lost(), sum.unmatched), (80, 20, 80));
         }
     }
+}
+
+#[test]
+fn a_history_counts_that_leaves_before_its_writer_is_announced() {
+    let mut host = Host::unannounced();
+    let group = CapturePoint {
+        socket: 9,
+        address: GROUP.parse().unwrap(),
+        directed: None,
+        flags: flag::HOST,
+    };
+    for number in 1..=20 {
+        host.data(group.leaving(), number);
+        host.wait(50);
+    }
+    let bob = host.reader(BOB, 7411);
+    host.owner(bob, BOB);
+    for number in 1..=20 {
+        if number == 12 {
+            host.writer(true);
+        }
+        host.data(bob.leaving(), number);
+        host.data(bob, number);
+    }
+    (21..=40).for_each(|number| {
+        host.wait(50);
+        host.data(bob.leaving(), number);
+        host.data(bob, number);
+    });
+    rest(&mut host);
+    let deliveries = host.topic().deliveries.into_iter();
+    let counts: Vec<_> = deliveries
+        .map(|each| {
+            (
+                each.direction,
+                each.delivered.messages,
+                each.delivered.lost(),
+            )
+        })
+        .collect();
+    assert_eq!(
+        counts,
+        [(Direction::Sent, 40, 0), (Direction::Received, 40, 0)]
+    );
+    assert_eq!(host.measurement().messages, 40);
 }
 
 #[test]
