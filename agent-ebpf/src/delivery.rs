@@ -52,7 +52,7 @@ static SENT: LruHashMap<u64, u64> = LruHashMap::with_max_entries(DELIVERY_CAPACI
 struct ReceiveQueue {
     /// Number of datagrams so far.
     datagram_count: u64,
-    /// Address of the socket, passed through memory to be a plain number.
+    /// Address of the socket. It is stored and read back, so that it is a number to the verifier.
     socket_address: u64,
     /// Time of the last receive call, and the accounting of its thread then.
     last_recvmsg_ns: u64,
@@ -279,7 +279,7 @@ unsafe fn note_delivery(
                 (*queue).stall_runnable = runnable;
                 (*queue).stall_throttled = throttled;
             } else if (*queue).last_stall_end_ns > arrived {
-                // The datagram arrived during that wait, behind the one that was received then.
+                // The datagram arrived during the last stall, behind the one received after it.
                 let overlap_ns = (*queue).last_stall_end_ns - arrived;
                 throttled += accounting::min((*queue).stall_throttled, overlap_ns);
                 runnable += accounting::min((*queue).stall_runnable, overlap_ns);

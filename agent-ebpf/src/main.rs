@@ -49,7 +49,7 @@ use crate::{
         release_slot,
     },
     packet::hook,
-    settings::read_global,
+    settings::{keep_frames_of_task, read_global},
 };
 
 /// `skb->pkt_type` of a frame that this host sends.
@@ -160,6 +160,7 @@ pub fn not_reassembled_unexplained(context: RawTracePointContext) -> u32 {
 #[uprobe]
 pub fn shm_handed(context: ProbeContext) -> u32 {
     handed::process_send(context.as_ptr() as *const u64, false);
+    keep_frames_of_task(&context);
     0
 }
 
@@ -167,6 +168,7 @@ pub fn shm_handed(context: ProbeContext) -> u32 {
 #[uprobe]
 pub fn shm_handed_list(context: ProbeContext) -> u32 {
     handed::process_send(context.as_ptr() as *const u64, true);
+    keep_frames_of_task(&context);
     0
 }
 

@@ -94,7 +94,7 @@ pub extern "C" fn write_piece(skb: *mut __sk_buff, slot: u32, base: u32, offset:
     push_piece(slot, &mut buffer)
 }
 
-/// Writes the piece in the buffer; returns 1 if it fit.
+/// Writes the piece that the buffer holds to the ring; returns 1 if it fit.
 #[inline(always)]
 pub fn push_piece(slot: u32, buffer: &mut PieceBuffer) -> u32 {
     let wake = if scratch(slot)

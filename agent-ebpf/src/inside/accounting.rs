@@ -125,7 +125,7 @@ pub fn read_u64(address: u64, of: usize) -> Option<u64> {
     let mut value = MaybeUninit::<u64>::zeroed();
     // SAFETY: the destination has the size of the member.
     let result = unsafe { read_u64_into(address, of, value.as_mut_ptr()) };
-    // SAFETY: any bytes are a number.
+    // SAFETY: every bit pattern is a valid `u64`.
     (result == 0).then(|| unsafe { value.assume_init() })
 }
 

@@ -35,7 +35,10 @@ use aya_ebpf::{
 };
 use ros2probe_wire::inside::announced;
 
-use crate::registers::{is_aarch64, register};
+use crate::{
+    registers::{is_aarch64, register},
+    settings::keep_frames_of_task,
+};
 
 /// Declares programs at the entry of functions. Each program reads as many arguments as it names.
 macro_rules! calls {
@@ -46,6 +49,7 @@ macro_rules! calls {
             pub fn $name(context: ProbeContext) -> u32 {
                 arguments!(context; $($argument),*);
                 $($body)*
+                keep_frames_of_task(&context);
                 0
             }
         )*

@@ -292,7 +292,7 @@ mod tests {
         62 22 0:56 / /mnt rw - fuseblk /dev/sda1 rw\n";
 
     #[test]
-    fn the_file_system_of_a_library_is_that_of_its_device() {
+    fn the_file_system_of_a_library_is_found_by_its_device() {
         for (device, name) in [
             ("fe:00", Some("ext4")),
             ("00:37", Some("fuse.sshfs")),

@@ -27,6 +27,12 @@ use crate::uprobe::attachments::Refusal;
 
 pub use ros2probe_attach::request::AttachMethod;
 
+/// Returns 1 on kernels on which programs of uprobes may contain tail calls, else 0: the value of
+/// `TAIL_CALLS` in the programs. AArch64 permits it from Linux 6.0 on.
+pub(crate) fn permits_tail_calls() -> u32 {
+    u32::from(AttachMethod::of_this_kernel() == AttachMethod::Links)
+}
+
 /// A program that tail-calls another one: the cookie of a function is its index in a program array.
 #[derive(Clone, Copy)]
 pub(crate) struct Dispatcher {
@@ -231,5 +237,41 @@ fn data(map: &Map) -> Option<&MapData> {
         | Map::ProgramArray(data)
         | Map::RingBuf(data) => Some(data),
         _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use aya_obj::ProgramSection;
+    use aya_obj::generated::{BPF_CALL, BPF_JMP};
+
+    use super::*;
+
+    /// Number of the helper `bpf_tail_call`.
+    const TAIL_CALL: i32 = 12;
+
+    #[test]
+    fn programs_of_uprobes_keep_their_frames_on_the_stack_of_their_task() {
+        let objects: [&[u8]; 2] = [
+            include_bytes!("filter.bpf.o"),
+            include_bytes!("inside/inside.bpf.o"),
+        ];
+        let mut names = 0;
+        for object in objects {
+            let object = Object::parse(object).unwrap();
+            for (name, program) in &object.programs {
+                if !matches!(program.section, ProgramSection::UProbe { .. }) {
+                    continue;
+                }
+                let function = &object.functions[&program.function_key()];
+                let has_tail_call = function.instructions.iter().any(|instruction| {
+                    let is_call = u32::from(instruction.code) == BPF_JMP | BPF_CALL;
+                    is_call && instruction.src_reg() == 0 && instruction.imm == TAIL_CALL
+                });
+                assert!(has_tail_call, "{name}");
+                names += 1;
+            }
+        }
+        assert!(names > 20, "{names}");
     }
 }

@@ -29,8 +29,8 @@ const MOUNTS_PATH: &str = "/proc/self/mountinfo";
 /// Mounts of the first process, which is the host's unless the process ids are the container's own.
 pub const FIRST_MOUNTS: &str = "/proc/1/mountinfo";
 
-/// Returns whether this process is in a container of Docker, podman or Kubernetes. A mark alone is
-/// no evidence, as virtual machines are made of images too.
+/// Returns whether this process is in a container of Docker, podman or Kubernetes. A marker alone
+/// proves nothing, because virtual machines may be built from container images.
 #[must_use]
 pub fn is_container() -> bool {
     let engine = std::env::var(CONTAINER_VARIABLE)

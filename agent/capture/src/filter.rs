@@ -21,6 +21,7 @@ use rustix::thread::{CapabilitySet, capabilities};
 use zerocopy::FromBytes;
 
 use super::bpf::failed_lookup;
+use super::breakpoints::permits_tail_calls;
 use super::container::{self, add};
 use super::tracepoints::KernelLayout;
 
@@ -453,6 +454,7 @@ fn open(
 ) -> Result<Ebpf, FilterError> {
     let in_place = u32::from(host);
     let preempted = u32::from(preempts_everything());
+    let tail_calls = permits_tail_calls();
     let ring = ring_size(settings.record_ring_bytes);
     let accept = u32::from(settings.accept_new_interfaces);
     let architecture = u32::from(cfg!(target_arch = "aarch64"));
@@ -467,6 +469,7 @@ fn open(
         .override_global("PREEMPTED", &preempted, true)
         .override_global("ARCHITECTURE", &architecture, true)
         .override_global("WITHIN", &within, true)
+        .override_global("TAIL_CALLS", &tail_calls, true)
         .override_global("ZENOH_PORTS", &settings.zenoh_ports, true)
         .override_global("WAKE_BYTES", &wake, true)
         .override_global("WAKE_PIECE_BYTES", &wake_pieces, true)

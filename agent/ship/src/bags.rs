@@ -19,7 +19,7 @@ pub(crate) const MAX_BAGS: usize = 10_000;
 const MAX_FILES: usize = 10_000;
 /// Time for which a bag without a lock must be unchanged, if its files are complete.
 const QUIET_TIME: Duration = Duration::from_secs(2);
-/// The same of a bag with an incomplete file: other recorders hold no lock.
+/// Like [`QUIET_TIME`], for an incomplete bag: other recorders hold no lock while they write.
 const INCOMPLETE_QUIET_TIME: Duration = Duration::from_mins(1);
 /// Key of a snapshot's trigger in the custom data of a bag.
 const TRIGGER_KEY: &str = "ros2probe_trigger";
@@ -41,7 +41,7 @@ pub(crate) struct Bag {
 /// What metadata.yaml and the ends of the files contain.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct Content {
-    /// Whether the recording ended in order: all files are complete, and metadata.yaml lists them.
+    /// Whether the recording ended cleanly: all files are complete, and metadata.yaml lists them.
     pub(crate) is_complete: bool,
     /// Event, request or signal that triggered a snapshot.
     pub(crate) trigger: Option<Value>,

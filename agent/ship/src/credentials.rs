@@ -49,7 +49,7 @@ impl Credentials {
     }
 }
 
-/// Reads a text that the key names.
+/// Reads the text file at `path`, the value of the configuration key `key`.
 pub(crate) fn read_text(key: &'static str, path: &Path) -> Result<String, SettingsError> {
     let read = || {
         let mut text = String::new();
@@ -84,7 +84,7 @@ mod tests {
     }
 
     #[test]
-    fn the_file_is_that_of_an_environment() {
+    fn a_file_is_read_like_an_environment_file_of_systemd() {
         let text =
             "# of robot-17\n\nAWS_ACCESS_KEY_ID=AK\n AWS_SECRET_ACCESS_KEY = \"a=b \"\n;x\nT='t'\n";
         let credentials = read(text).unwrap_or_default();

@@ -25,7 +25,7 @@ const READ_BYTES: usize = 256 << 10;
 /// Maximum number of bags of one name at the destination.
 const MAX_NAMESAKES: u32 = 1_000;
 
-/// How far a delivery came.
+/// Result of an attempt to deliver a bag.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Step {
     /// The destination has the bag.
@@ -254,7 +254,7 @@ impl Shipper {
             return Ok(Sent::Done);
         };
         if file.is_sent {
-            // Each answer is recorded, so that a poor link leads to an end as well.
+            // Each response is recorded, so that a delivery over a poor link also completes.
             file.is_delivered = store.size(&path).await? == Some(file.bytes);
             file.is_sent = file.is_delivered;
             file.upload = None;
@@ -523,7 +523,7 @@ mod tests {
     }
 
     #[test]
-    fn a_checksum_is_that_of_a_file_of_the_expected_size() {
+    fn a_file_of_an_unexpected_size_has_no_checksum() {
         let file = tempfile::NamedTempFile::new().unwrap();
         std::fs::write(file.path(), "abc").unwrap();
         let checksum = |bytes| {

@@ -1,7 +1,7 @@
 //! Delivery of finished bags to an object store or a folder.
 //!
 //! A bag is a directory below that of the recordings. Its files are delivered in parts, then a
-//! manifest with their checksums: a bag is complete at the destination exactly if its manifest
+//! manifest with their checksums: a bag is complete at the destination if and only if its manifest
 //! exists. Each part is recorded once it is delivered, so that a killed process continues.
 //!
 //! - [`Settings`] select destination, bandwidth and times.

@@ -27,7 +27,7 @@ struct State {
     refusal: Option<Refusal>,
 }
 
-/// An answer that is no success.
+/// A response whose status is not a success.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Refusal {
     pub(crate) status: StatusCode,
@@ -52,7 +52,7 @@ impl Link {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Takes a turn for bytes, and returns the time from which they may be sent.
+    /// Reserves bandwidth for bytes, and returns the time from which they may be sent.
     pub(crate) fn reserve(&self, bytes: usize) -> Instant {
         let mut state = self.state();
         let now = Instant::now();
@@ -75,13 +75,13 @@ impl Link {
         state.refusal = None;
     }
 
-    /// Records an answer that is no success.
+    /// Records a response whose status is not a success.
     pub(crate) fn refused(&self, status: StatusCode, pause: Option<Duration>) {
         let pause = pause.map(|pause| pause.min(LONGEST_PAUSE));
         self.state().refusal = Some(Refusal { status, pause });
     }
 
-    /// Returns the answer to the last request, if it is no success.
+    /// Returns the response to the last request if its status is not a success.
     pub(crate) fn refusal(&self) -> Option<Refusal> {
         self.state().refusal
     }

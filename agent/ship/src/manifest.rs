@@ -19,7 +19,7 @@ pub struct Manifest {
     pub robot: String,
     /// Name of the bag on the robot.
     pub bag: String,
-    /// Whether the recording ended in order. If not, `rp bag reindex` completes the files.
+    /// Whether the recording ended cleanly. If not, `rp bag reindex` completes the files.
     pub is_complete: bool,
     /// Event, request or signal that triggered a snapshot, as in the custom data of the bag.
     pub trigger: Option<Value>,

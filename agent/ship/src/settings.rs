@@ -65,7 +65,7 @@ pub enum SettingsError {
         /// Error of the operating system.
         source: io::Error,
     },
-    /// A file with credentials has a line that is none.
+    /// A line of the credentials file is not `NAME=value` with a name of this store.
     #[error("ship.credentials_file: line {line} of {} is not NAME=value with a name of this store", path.display())]
     Credentials {
         /// Path of the file.

@@ -22,7 +22,7 @@ use crate::store::Store;
 
 /// Time between two scans of the directory.
 const SCAN_INTERVAL: Duration = Duration::from_secs(2);
-/// Time after which a status is written again of which only times have changed.
+/// Time after which the status is written again even if only its times have changed.
 const STATUS_INTERVAL: Duration = Duration::from_mins(1);
 /// Pauses after a failure.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
@@ -265,7 +265,7 @@ impl Shipper {
         !self.is_permitted(bag) || self.is_overtaken(bag)
     }
 
-    /// Returns whether a triggered bag waits behind this one, which is not.
+    /// Returns whether a triggered bag waits behind this bag, which is not triggered.
     pub(crate) fn is_overtaken(&mut self, bag: &Bag) -> bool {
         let is_due = self
             .last_scan
@@ -311,7 +311,7 @@ impl Shipper {
                 let is_delivered = record.is_some_and(|record| {
                     record.is_delivered && record.fingerprint == bag.fingerprint
                 });
-                // Windows hold for the requests that confirm a bag.
+                // Windows also apply to the requests that confirm a bag.
                 is_delivered && self.is_permitted(bag) && !self.aside(&bag.name).exists()
             };
             let bags = self.found.bags.iter().filter(is_delivered);

@@ -31,7 +31,7 @@ pub(crate) struct Delivery {
     pub(crate) fingerprint: Fingerprint,
     /// Name of the bag at the destination; `None` until it is chosen.
     pub(crate) remote: Option<String>,
-    /// Whether its recording ended in order.
+    /// Whether its recording ended cleanly.
     pub(crate) is_complete: bool,
     pub(crate) files: Vec<FileDelivery>,
     /// Text of the manifest, once all files are delivered.
@@ -60,7 +60,7 @@ pub(crate) struct FileDelivery {
     pub(crate) upload: Option<Upload>,
     /// Whether the destination accepted all of it.
     pub(crate) is_sent: bool,
-    /// Whether the destination has it in its size.
+    /// Whether the destination has the file in its full size.
     pub(crate) is_delivered: bool,
 }
 
@@ -139,7 +139,7 @@ impl Records {
             let path = entry.map_err(wrong)?.path();
             let is_record = path.extension().is_some_and(|end| end == RECORD_EXTENSION);
             let name = path.file_stem().and_then(|name| name.to_str());
-            // A damaged record is as none: the bag is compared with the destination.
+            // A damaged record counts as missing: the bag is compared with the destination.
             if let Some(name) = name.filter(|_| is_record)
                 && let Some(mut delivery) = read_json::<Delivery>(&path)
             {
@@ -279,7 +279,7 @@ mod tests {
     }
 
     #[test]
-    fn a_receipt_is_that_of_the_bag_as_it_was_delivered() {
+    fn a_bag_that_changed_after_its_delivery_is_not_delivered() {
         let root = tempfile::tempdir().unwrap();
         let state = root.path().join("state");
         let bag = bag(root.path(), "lap");

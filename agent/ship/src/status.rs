@@ -21,9 +21,9 @@ pub struct Status {
     pub waiting_bags: u64,
     /// Bytes of all bags that wait.
     pub waiting_bytes: u64,
-    /// Number of bags that are recorded at this time.
+    /// Number of bags that are still being recorded, or have just changed.
     pub unfinished_bags: u64,
-    /// Bag that is delivered at this time.
+    /// Bag that is being delivered.
     pub uploading: Option<Uploading>,
     /// Number of bags that were delivered since the first start.
     pub delivered_bags: u64,
@@ -39,7 +39,7 @@ pub struct Status {
     pub opens_in_seconds: u64,
 }
 
-/// A bag that is delivered at this time.
+/// A bag that is being delivered.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Uploading {
     /// Name of the bag.

@@ -236,7 +236,7 @@ impl Store {
     }
 }
 
-/// A file in a folder, which has its name once it is complete.
+/// A file in a folder. It gets its final name once it is complete.
 pub(crate) struct FolderFile {
     upload: Box<dyn object_store::MultipartUpload>,
     link: Arc<Link>,
@@ -407,7 +407,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn only_the_code_of_an_answer_is_printed() {
+    fn only_the_error_code_of_a_response_is_printed() {
         let answer =
             "403 <Error><Code>InvalidAccessKeyId</Code><AWSAccessKeyId>AK</AWSAccessKeyId>";
         assert_eq!(code(answer), " (InvalidAccessKeyId)");

@@ -19,7 +19,7 @@ pub struct Window {
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Windows(pub Vec<Window>);
 
-/// The text is no window.
+/// The text is not a valid window.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("two different times of the day, as in `22:00-06:00`")]
 pub struct InvalidWindow;

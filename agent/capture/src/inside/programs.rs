@@ -101,11 +101,13 @@ pub fn load(
 ) -> Result<(Programs, Tables), FilterError> {
     let architecture = u32::from(cfg!(target_arch = "aarch64"));
     let offsets = accounting_offsets(KernelTypes::read().ok().as_ref());
+    let tail_calls = breakpoints::permits_tail_calls();
     let (callbacks, within) = (u32::from(has_callbacks), within.unwrap_or(0));
     let ebpf = EbpfLoader::new()
         .override_global("ARCHITECTURE", &architecture, true)
         .override_global("CALLBACKS", &callbacks, true)
         .override_global("WITHIN", &within, true)
+        .override_global("TAIL_CALLS", &tail_calls, true)
         .override_global("ACCOUNTING", &offsets, true)
         .load(&OBJECT.0)
         .map_err(FilterError::load)?;

@@ -96,8 +96,8 @@ impl Block<'_> {
     fn bytes(&self) -> &[u8] {
         let start = self.turns.start();
         // SAFETY: the block is mapped while the ring lives, and `self` borrows the ring. The block
-        // belongs to user space since `Turns::block` saw TP_STATUS_USER. Until the drop, neither
-        // the kernel nor this process writes to it. Any bytes are valid `u8`.
+        // belongs to user space since `BlockReader::block` saw TP_STATUS_USER. Until the drop,
+        // neither the kernel nor this process writes to it. Any bytes are valid `u8`.
         unsafe { std::slice::from_raw_parts(start.as_ptr(), self.turns.block_size) }
     }
 }

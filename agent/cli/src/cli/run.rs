@@ -37,7 +37,8 @@ pub(crate) struct Run {
     /// At the end of the capture, print the metrics on stdout and exit
     #[arg(long, requires = "replay")]
     pub(crate) report: bool,
-    /// Also measure this topic or glob, e.g. /points or '/camera/**'; may be repeated
+    /// Also measure this topic or glob, e.g. /points or '/camera/**'; may be repeated. A replay
+    /// without any measures all topics
     #[arg(long, value_name = "GLOB", value_parser = watch)]
     pub(crate) watch: Vec<Watch>,
     /// Address and port of the metrics listener, or `off`, instead of the configured one

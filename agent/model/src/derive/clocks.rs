@@ -39,8 +39,8 @@ const MAX_SENT_PER_WRITER: usize = 16;
 const MAX_RESPONSE_DELAY: Duration = Duration::from_millis(500);
 /// Latest messages of writers that no peer has acknowledged so far.
 const MAX_UNACKNOWLEDGED_WRITERS: usize = 32;
-/// Nanoseconds between two clocks, beyond the uncertainty: from the first number on the offset is a
-/// finding, and below the second it is none any longer.
+/// Nanoseconds between two clocks, beyond the uncertainty: an offset becomes a finding at the first
+/// number, and the finding ends below the second.
 const MIN_OFFSET_OF_FINDING: i64 = 10_000_000;
 const MAX_OFFSET_OF_RESOLUTION: i64 = 5_000_000;
 

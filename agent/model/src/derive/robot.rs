@@ -1,5 +1,5 @@
-//! What the robot itself says, in topics of standard types. The agent reads them as they pass,
-//! without a watch and without a subscription.
+//! Reports of the robot about itself, on topics of standard types. The agent reads them as they
+//! pass, without a watch and without a subscription.
 //!
 //! A writer of such a type is captured within an allowance of its own and one for all writers. A
 //! writer that exceeds its allowance is paused for some seconds. Each message is decoded once,
@@ -55,7 +55,7 @@ const ASSEMBLY_BYTES: usize = 1 << 20;
 const WRITER_ALLOWANCE: Allowance = Allowance::new(1 << 20, 64 << 10);
 /// Bytes of all writers that may be captured in a burst, and per second.
 const COMMON_ALLOWANCE: Allowance = Allowance::new(8 << 20, 512 << 10);
-/// The same of transforms: a message each of thirty joints, 100 times a second, is 300 KB/s.
+/// Allowances for transforms: thirty joints with one message each at 100 Hz send 300 KB/s.
 const BROADCASTER_ALLOWANCE: Allowance = Allowance::new(2 << 20, 512 << 10);
 const COMMON_BROADCASTER_ALLOWANCE: Allowance = Allowance::new(8 << 20, 2 << 20);
 /// A paused writer is captured again once it is allowed this many bytes.
@@ -129,13 +129,13 @@ pub struct RobotExpectations {
     pub fields: Arc<Vec<TopicName>>,
 }
 
-/// Writers of standard types, and what they said.
+/// Writers of standard types, and the content of their messages.
 #[derive(Debug)]
 pub struct Robot {
     writers: Bounded<Counted<RobotWriters>, HashMap<Guid, RobotWriter>>,
     /// Whether the full table refused a writer since [`Robot::retry`].
     has_refused: bool,
-    /// The same of the table of writers with frames.
+    /// Like `has_refused`, for the table of writers with frames.
     has_refused_frame: bool,
     assembly: Assembly,
     allowances: Allowances,
@@ -692,7 +692,7 @@ impl Robot {
             + self.memory_changes
     }
 
-    /// Returns what the robot says about problems of its own.
+    /// Returns the problems that the robot reports about itself.
     pub fn findings(&self) -> impl Iterator<Item = Diagnosis> {
         let logged = self.logs.findings();
         let memory = MemoryFault::ALL.into_iter().zip(self.memory_faults);
@@ -786,7 +786,7 @@ mod tests {
     const LATER: Timestamp = Timestamp(MIN_INCARNATION_GAP.as_nanos() as u64 + 2);
 
     #[test]
-    fn a_number_is_read_once_and_old_ones_are_copies() {
+    fn a_sequence_number_is_new_once_and_numbers_below_the_window_are_copies() {
         let mut read = ReadNumbers::default();
         let mut is_new = |number| {
             let number = SequenceNumber(number);

@@ -65,7 +65,7 @@ struct StampWriter {
 struct Ages {
     messages: u32,
     least: i64,
-    /// The least age but one.
+    /// The second-lowest age.
     next: i64,
 }
 
@@ -86,7 +86,7 @@ impl Stamps {
         at: ModelTime,
         topic: impl FnOnce() -> Option<TopicKey>,
     ) {
-        // A header without a stamp says nothing.
+        // A header without a stamp is not evidence.
         if stamp == (0, 0) {
             return;
         }

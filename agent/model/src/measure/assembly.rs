@@ -24,8 +24,8 @@ const FRAGMENT_TIMEOUT: Duration = Duration::from_secs(30);
 const MIN_ALLOCATION: usize = 4096;
 /// Minimum size of a buffer that is reused: the kernel would have to clear each page of a new one.
 const MIN_REUSED_BUFFER: usize = 128 << 10;
-/// Maximum number of buffers kept for reuse, and the time without a sample after which they are
-/// freed.
+/// Maximum number of buffers kept for reuse, and the time from the last fragment of a payload until
+/// its buffer is freed.
 const MAX_SPARE_BUFFERS: usize = 4;
 const SPARE_BUFFER_LIFETIME: Duration = Duration::from_secs(10);
 

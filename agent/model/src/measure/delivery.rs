@@ -37,8 +37,8 @@ pub use accounting::Totals;
 
 /// Samples that left this host less than this ago may still arrive.
 const MAX_TRANSIT_TIME: Duration = Duration::from_secs(1);
-/// Samples that left for a receiver count as lost if it shows no sign of life for this time. Socket
-/// diagnostics of the kernel report a closed socket earlier.
+/// After this time without a sign of life, the samples that left for the receiver in its first
+/// [`START_GRACE`] count as lost. Socket diagnostics report a closed socket earlier.
 const SILENCE: Duration = Duration::from_secs(18);
 const START_GRACE: Duration = Duration::from_secs(5);
 /// A run of pending losses longer than this is settled when two deliveries merge.

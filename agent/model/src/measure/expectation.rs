@@ -1,17 +1,16 @@
 //! Evaluates the expectations of watchlist entries on their topics.
 //!
 //! Evaluation takes place once per second of the source's clock. A topic becomes violated after
-//! `BAD` bad evaluations in a row and recovers after `EVALUATIONS_TO_RECOVER` good ones. Rates are
-//! evaluated over a window of at least three expected messages (1 to 10 s), or over the window of
-//! the entry. One message of tolerance at the window's edges keeps a healthy periodic topic stable.
-//! If less than one message is due in the window, `min_rate_hz` is evaluated as a silence of
-//! `SLOW_TOPIC_INTERVALS` intervals.
-//! Latency is that of the last second. A second without a message keeps the verdict of the last two
-//! with messages, so that a slow topic needs two late ones. Silence has its own time and no
-//! hysteresis. A silence between two messages, which ended before it was evaluated, violates at
-//! once, and recovers as the others do. The end of a window counts for `min_rate_hz` only as far as
-//! its messages are known. The messages of a sampled topic are known once polling sees the next
-//! one.
+//! `EVALUATIONS_TO_VIOLATE` bad evaluations in a row and recovers after `EVALUATIONS_TO_RECOVER`
+//! good ones. Rates are evaluated over a window of at least three expected messages (1 to 10 s), or
+//! over the window of the entry. One message of tolerance at the window's edges keeps a healthy
+//! periodic topic stable. If less than one message is due in the window, `min_rate_hz` is evaluated
+//! as a silence of `SLOW_TOPIC_INTERVALS` intervals. Latency is that of the last second. A second
+//! without a message keeps the verdict of the last two with messages, so that a slow topic needs
+//! two late ones. Silence has its own time and no hysteresis. A silence between two messages, which
+//! ended before it was evaluated, violates at once, and recovers as the others do. The end of a
+//! window counts for `min_rate_hz` only as far as its messages are known. The messages of a sampled
+//! topic are known once polling sees the next one.
 //!
 //! Windows and silences begin at the earliest when the agent can see the messages. That is after
 //! its own start, the first publisher or subscriber, and a time in which the source saw nothing. A
@@ -646,7 +645,7 @@ mod tests {
     }
 
     #[test]
-    fn a_rate_below_a_message_in_its_window_is_violated_by_one_and_a_half_intervals() {
+    fn a_rate_of_less_than_one_message_per_window_is_violated_after_one_and_a_half_intervals() {
         let (ok, bad) = (WatchState::Ok, WatchState::Violated);
         for (minimum, window_s, interval) in
             [(0.025, None, 40), (0.08, None, 12), (0.5, Some(1), 2)]
@@ -730,7 +729,7 @@ mod tests {
     }
 
     #[test]
-    fn a_missing_subscriber_is_the_only_violation_of_a_writer_that_stops_without_it() {
+    fn a_writer_that_is_silent_without_subscribers_violates_only_the_subscriber_count() {
         let mut bench = counted(None, Some(1));
         bench.subscriptions = 0;
         let states = [(); 5].map(|()| bench.second(rate(0)));

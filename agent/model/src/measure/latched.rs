@@ -56,7 +56,7 @@ pub struct Latched {
     allowance: CommonAllowance,
 }
 
-/// Properties of a writer that its kept message needs.
+/// Properties of a writer that are needed to keep its last message.
 #[derive(Clone, Debug)]
 pub struct LatchedTopic {
     /// Its topic.

@@ -21,8 +21,8 @@ const WINDOW_SECONDS: usize = 10;
 const MAX_SILENCE: Duration = Duration::from_secs(130);
 /// Time without a report after which a link is forgotten.
 const LINK_TIMEOUT: Duration = Duration::from_secs(600);
-/// Segments of 1000 that are retransmitted: from the first number on the link is a finding, and
-/// below the second it is none any longer.
+/// Retransmitted segments per 1000: a link becomes a finding at the first number, and the finding
+/// ends below the second.
 const LOSSY_PERMILLE: u64 = 20;
 const RECOVERED_PERMILLE: u64 = 10;
 /// Minimum number of retransmitted segments of a finding.
@@ -332,7 +332,7 @@ mod tests {
         for second in 0..60 {
             match second {
                 0..10 => sent += 30,
-                // TCP only retransmits, ever more seldom.
+                // TCP only retransmits, at growing intervals.
                 10..13 => (sent, again) = (sent + 2, again + 2),
                 _ => (sent, again) = (sent + second % 2, again + second % 2),
             }

@@ -228,8 +228,8 @@ impl KnownRoute {
         }
     }
 
-    /// Returns the time from which [`Self::mark`] remembers this number; [`ModelTime::MAX`] if it
-    /// is remembered.
+    /// Returns the time from which [`Self::note_departure`] remembers this number;
+    /// [`ModelTime::MAX`] if it is already remembered.
     #[must_use]
     pub fn next_mark(&self, number: SequenceNumber) -> ModelTime {
         let last = self.left.back().filter(|(_, last)| *last != number);
@@ -252,7 +252,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_last_sample_that_had_left_by_a_time_is_remembered_for_a_while() {
+    fn the_newest_sample_that_left_by_a_recent_time_is_known() {
         let mut known = KnownRoute {
             route: Route {
                 direction: Direction::Sent,

@@ -18,7 +18,7 @@ use crate::measure::sequence::{MAX_WINDOW, NumberRange, Run, RunMembership, Sequ
 const SAMPLED_TIMEOUT: Duration = Duration::from_secs(10);
 /// Time that an unseen sample may take to arrive by another transport before it is skipped.
 const ARRIVAL_TIMEOUT: Duration = Duration::from_millis(200);
-/// Accepted probability that a silence is claimed while messages are sent.
+/// Accepted probability of reporting a silence while messages are sent.
 const FALSE_SILENCE_PROBABILITY: f64 = 1e-6;
 /// Number of messages presumed before the first one is seen, and the share of them that polling
 /// missed. On a busy machine, polling misses nine of ten large messages. The same is presumed after
@@ -28,7 +28,7 @@ const PRESUMED_MISSED_SHARE: f64 = 0.9;
 /// Maximum time in which polling sees no message of a topic on a busy machine. Measured with Fast
 /// DDS: 0.4 s on an idle machine, more than 2 s for point clouds at a load of 10.
 const MAX_POLLING_GAP: Duration = Duration::from_secs(10);
-/// Factor by which a row of missed messages may exceed the longest one so far.
+/// Factor by which a run of missed messages may exceed the longest run so far.
 const MISSED_RUN_FACTOR: f64 = 3.0;
 /// Weight of the newest interval in the moving average.
 const NEWEST_WEIGHT: f64 = 0.125;

@@ -60,8 +60,8 @@ pub struct Subscribers {
     at_socket: bool,
     /// Whether any participant has a reader that matches the writer.
     has_readers: bool,
-    /// Whether the writer applies a content filter of each reader to which its samples are seen to
-    /// go.
+    /// Whether the writer applies a content filter for each reader that is seen to receive its
+    /// samples.
     is_filtered: bool,
     /// Losses in this second of the worst receiver that is gone.
     departed: LossShare,
@@ -152,8 +152,8 @@ impl Subscribers {
         &self.totals
     }
 
-    /// Returns whether the writer applies a content filter of each reader to which its samples are
-    /// seen to go.
+    /// Returns whether the writer applies a content filter for each reader that is seen to receive
+    /// its samples.
     #[must_use]
     pub const fn is_filtered(&self) -> bool {
         self.is_filtered

@@ -109,7 +109,7 @@ pub struct Writer {
     exact: Option<ModelTime>,
     /// Whether the uprobe's view has ended, and no other view has shown a sample since.
     has_lost_view: bool,
-    /// Whether it applies a content filter of each reader to which its samples are seen to go.
+    /// Whether it applies a content filter for each reader that is seen to receive its samples.
     is_filtered: bool,
 }
 
@@ -150,8 +150,8 @@ impl Writer {
         }
     }
 
-    /// Sets whether it applies a content filter of each reader to which its samples are seen to go.
-    /// Missing samples are then irrelevant, because the filters may have rejected them.
+    /// Sets whether it applies a content filter for each reader that is seen to receive its
+    /// samples. Missing samples are then irrelevant, because the filters may have rejected them.
     pub const fn filter(&mut self, is_filtered: bool) {
         self.is_filtered = is_filtered;
     }

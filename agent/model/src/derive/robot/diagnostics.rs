@@ -23,7 +23,7 @@ const MAX_NAME: usize = 128;
 const MAX_TEXT: usize = 256;
 /// Maximum number of values of one status.
 const MAX_STATUS_VALUES: usize = 64;
-/// A status is stale after this silence, if it came more often.
+/// Minimum silence after which a repeated status is stale; otherwise three intervals.
 const MIN_STALE_SILENCE: Duration = Duration::from_secs(5);
 /// A status that came once is stale after this silence.
 const SINGLE_STATUS_SILENCE: Duration = Duration::from_secs(120);

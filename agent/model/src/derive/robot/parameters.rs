@@ -54,7 +54,7 @@ pub struct Parameters {
     counts: Bounded<Counted<ChangedNodes>, BTreeMap<(DomainId, NodeName), u64>>,
     /// What the configuration expects.
     expected: BTreeMap<(NodeName, Arc<str>), Arc<str>>,
-    /// Domains whose nodes have different clocks, with the time since which they have.
+    /// Domains whose nodes use different clocks, and the time since which they do.
     mixed: BTreeMap<DomainId, ModelTime>,
     findings: Vec<Diagnosis>,
     revision: u64,

@@ -1,7 +1,7 @@
 //! Transforms: the trees of frames, their broadcasters, and what is wrong with them.
 //!
 //! A tree belongs to one domain and one namespace, because a robot may publish on `/robot1/tf` and
-//! `/robot1/tf_static`. Its child frame, which has one parent, identifies an edge.
+//! `/robot1/tf_static`. An edge is identified by its child frame, because a frame has one parent.
 
 mod edge;
 
@@ -178,8 +178,8 @@ impl Transforms {
         }
     }
 
-    /// Returns whether the domain has transforms, and none of them has this frame. A static one
-    /// that was sent before the agent started may have it.
+    /// Returns whether the domain has transforms, and none of them has this frame. Returns `false`
+    /// while messages of a static broadcaster are unread, because one of them may have the frame.
     pub(super) fn is_unknown_frame(&self, domain_id: DomainId, frame: &str) -> bool {
         let of_domain = || self.trees.iter().filter(|tree| tree.domain_id == domain_id);
         let mut unread = self.broadcasters.values();

@@ -131,8 +131,8 @@ impl<'a> MatchedReaders<'a> {
         !readers.is_empty() && readers.iter().all(|guid| self.is_filtered(*guid))
     }
 
-    /// Returns whether the writer applies a content filter of this reader. A writer of Fast DDS
-    /// applies those of Fast DDS; a writer of another vendor sends the reader all samples.
+    /// Returns whether the writer applies a content filter of this reader. It does so only for
+    /// readers of its own vendor; a reader of another vendor receives all samples.
     fn is_filtered(self, reader: Guid) -> bool {
         let discovery = &self.graph.discovery;
         let vendor = |guid: Guid| {

@@ -77,7 +77,7 @@ impl Sequence {
         let continues =
             || unconfirmed.is_some_and(|unconfirmed| unconfirmed.is_continued(number, self.next));
         // The first samples may have been forged as well, so a lower number far away is
-        // unconfirmed. A lower number within `FAR` is history.
+        // unconfirmed. A lower number within `MAX_ANNOUNCED_JUMP` is history.
         let is_young = self.followed < REQUIRED_CONFIRMATIONS;
         // The source time of a number above `newest` is unknown: it arrived by another route.
         let is_repeated = || number <= self.newest && self.has(number);

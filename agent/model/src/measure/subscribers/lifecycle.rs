@@ -60,8 +60,8 @@ impl Subscribers {
         times.min().unwrap_or(ModelTime::MAX)
     }
 
-    /// Returns the next whole second whose end has an effect. Observations may have changed
-    /// anything since the last one.
+    /// Returns the next whole second whose end has an effect. Between two whole seconds it is the
+    /// next one, because an observation in between may have changed anything.
     fn next_second(&self, now: ModelTime) -> ModelTime {
         let second = ModelTime::of_second(now.whole_seconds() + 1);
         let is_open = !now.nanoseconds().is_multiple_of(SECOND);

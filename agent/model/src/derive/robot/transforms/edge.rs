@@ -19,7 +19,8 @@ const RATE_SECONDS: usize = 10;
 /// An edge is silent after this time, and after five of its longest intervals.
 const SILENCE: Duration = Duration::from_secs(3);
 const SILENT_INTERVALS: u32 = 5;
-/// Two broadcasters are a fault if both broadcast within this time.
+/// Two broadcasters are a fault if both have broadcast for at least this time, and the last
+/// transform of each is not older than this.
 const DUPLICATE_BROADCASTER_WINDOW: Duration = Duration::from_secs(5);
 /// Static broadcasters repeat nothing: both are a fault after this time, in which the lease of one
 /// that crashed ends.
@@ -147,7 +148,7 @@ impl Edge {
             .unwrap_or_default()
     }
 
-    /// Adds a transform. Returns a jump.
+    /// Adds a transform. Returns the kind of jump, or `None` if it is not a jump.
     pub(super) fn add(
         &mut self,
         origin: &Origin<'_>,
