@@ -54,7 +54,14 @@ fn page_series(page: &str) -> BTreeMap<Labels, f64> {
         let mut labels: Labels = labels
             .map(|label| {
                 let (name, value) = label.split_once("=\"").unwrap();
-                (name.to_owned(), value.trim_end_matches('"').to_owned())
+                let value = value.trim_end_matches('"');
+                // Prometheus stores the bound `1` as `1.0`.
+                let bound = value.parse().ok().filter(|bound: &f64| bound.is_finite());
+                let value = match bound.filter(|_| name == "le") {
+                    Some(bound) => format!("{bound:?}"),
+                    None => value.to_owned(),
+                };
+                (name.to_owned(), value)
             })
             .filter(|(_, value)| !value.is_empty())
             .collect();
