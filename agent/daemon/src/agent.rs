@@ -414,9 +414,6 @@ fn with_overrides(configured: &Config, options: &Options) -> Config {
     if let Some(private) = &options.private {
         private.restrict(&mut config);
     }
-    if options.replay.is_some() && config.watches.is_empty() && options.watch.is_empty() {
-        config.watches.extend(Watch::named("/**"));
-    }
     if options.replay.is_some() && options.config.is_none() {
         // The receivers in the configuration of the installed agent are for the robot's present.
         config.remote_write.url = None;

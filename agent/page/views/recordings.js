@@ -34,8 +34,8 @@ export function Recordings() {
       : data.directory && html`<p class="empty">No recording yet.</p>`)}
     ${data?.kept?.length > 0 && html`<section aria-labelledby="kept"><h2 id="kept">Earlier bags</h2>
       <p class="dim">Bags of earlier runs of the agent, and snapshots, in <${Name}
-        text=${data.directory} />. <code>rp run --replay BAG --api 127.0.0.1:17411 --api-loopback all --metrics
-        off --foxglove off</code> plays one in this page, at port 17411.</p>
+        text=${data.directory} />. <code>rp run --replay BAG --watch '/**' --api 127.0.0.1:17411 --api-loopback all
+        --metrics off --foxglove off</code> plays one in this page, at port 17411.</p>
       <div class="scroll tall" tabindex="0" role="group" aria-labelledby="kept"><table>
       <thead><tr><th scope="col">Bag</th><th scope="col">Last change</th>
         <th scope="col" class="number">Size</th><th scope="col">Trigger</th>

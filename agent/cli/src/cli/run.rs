@@ -37,8 +37,7 @@ pub(crate) struct Run {
     /// At the end of the capture, print the metrics on stdout and exit
     #[arg(long, requires = "replay")]
     pub(crate) report: bool,
-    /// Also measure this topic or glob, e.g. /points or '/camera/**'; may be repeated. A replay
-    /// without any measures all topics
+    /// Also measure this topic or glob, e.g. /points or '/camera/**'; may be repeated
     #[arg(long, value_name = "GLOB", value_parser = watch)]
     pub(crate) watch: Vec<Watch>,
     /// Address and port of the metrics listener, or `off`, instead of the configured one

@@ -43,6 +43,8 @@ await scenario(async (open) => {
   await row('/after_restart').getByRole('link').click();
   const message = tab.page.locator('section[aria-labelledby="live"]');
   await reads(message, /number [\d,]+ by \/other/);
+  // The next agent does not know the topic before its robot starts.
+  tab.expect(/404 .*topics\/%2Fafter_restart/);
   await ask('kill');
   await tab.shows('No connection', 'body');
   await reads(message, 'the connection was lost');
