@@ -1,5 +1,5 @@
-//! Constants that the loader sets before it loads the programs, and the processes that a constant
-//! selects.
+//! Constants that the loader sets before it loads the programs, and what some of them select: the
+//! observed processes, and the stack of programs of uprobes.
 
 use aya_ebpf::{
     helpers::generated::bpf_get_current_ancestor_cgroup_id, macros::map, maps::ProgramArray,

@@ -132,7 +132,37 @@ pub struct AssembledAgent {
     pub reloads: Reloads,
 }
 
-impl Components<'_> {
+impl<'a> Components<'a> {
+    /// Returns the parts of an agent that replays a capture once, and that keeps, exports and
+    /// records nothing.
+    #[must_use]
+    pub fn of_replay(
+        config: &'a Config,
+        replay: Replay,
+        sources: MetricSources,
+        watches: Arc<Watches>,
+        doctor: Doctor,
+    ) -> Self {
+        Self {
+            config,
+            source: Source::Replay(Box::new(replay)),
+            observer: Observer::new(observer::Settings::default()),
+            sources,
+            spans: Arc::default(),
+            node_logs: Arc::default(),
+            watches,
+            state_writer: None,
+            recordings: None,
+            receipts: None,
+            library: Arc::new(Library::new(Sources::default())),
+            history: Duration::ZERO,
+            restart: None,
+            addresses: Vec::new(),
+            doctor,
+            stop: CancellationToken::new(),
+        }
+    }
+
     /// Connects the parts. Starts only the threads of configured snapshots.
     ///
     /// # Errors
@@ -264,7 +294,8 @@ pub fn run(options: Options) -> Result<()> {
     sources.lost_lines = log.lost_lines();
     let library = Arc::new(library());
     sources.fields = Arc::new(FieldMetrics::new(&config.extractions, Arc::clone(&library)));
-    let watches = watches(&config, options.watch, &sources)?;
+    let watches = sources.watches(config.watches.clone(), options.watch);
+    let watches = watches.context("the watchlist is unusable")?;
     let (server, mut control) = listeners(&config, &sources)?;
     // A replay runs as the user of the command line and accesses that user's files.
     if matches!(source, Source::Live(_)) {
@@ -464,19 +495,6 @@ fn remote_write(config: &Config) -> Result<Option<remote_write::Settings>> {
         file::read_text,
         &Host::read(),
     )?)
-}
-
-/// Creates the watches of the configuration and of the command line.
-fn watches(config: &Config, given: Vec<Watch>, sources: &MetricSources) -> Result<Arc<Watches>> {
-    let watches = Watches::new(
-        Arc::clone(&sources.limits),
-        Arc::clone(&sources.events),
-        Arc::clone(&sources.settings),
-        Arc::clone(sources.latest.bell()),
-        config.watches.clone(),
-        given,
-    );
-    Ok(Arc::new(watches.context("the watchlist is unusable")?))
 }
 
 /// Returns the time span of figures. It is zero without an API listener, since only API clients

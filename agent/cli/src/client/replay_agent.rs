@@ -9,16 +9,14 @@ use std::time::{Duration, Instant};
 use ros2probe_capture::pcap::{PcapError, Speed, link_name};
 use ros2probe_capture::reassembly::Limits;
 use ros2probe_daemon::agent::{AssembledAgent, Components};
-use ros2probe_daemon::agent_facts::AgentFacts;
+use ros2probe_daemon::agent_facts::{AgentFacts, SourceKind};
 use ros2probe_daemon::config::{Config, RetainChoice, Watch};
 use ros2probe_daemon::run::replay::{self, BagError, Replay, ReplayControl, pause_at};
-use ros2probe_daemon::run::{CaptureTime, Run, RunError, Source};
+use ros2probe_daemon::run::{CaptureTime, Run, RunError};
 use ros2probe_daemon::settings_cell::Settings;
 use ros2probe_daemon::snapshot_cell::SnapshotCell;
 use ros2probe_daemon::surface::MetricSources;
 use ros2probe_daemon::surface::api;
-use ros2probe_daemon::watches::Watches;
-use ros2probe_message::{Library, Sources};
 use ros2probe_model::observe::observer::{self, Observer};
 use ros2probe_wire::Expansion;
 use ros2probe_wire::frame::Link;
@@ -227,17 +225,10 @@ fn assemble(
     config: &Config,
     stop: CancellationToken,
 ) -> io::Result<AssembledAgent> {
-    let source = Source::Replay(Box::new(replay));
-    let sources = MetricSources::new(source.kind(), Settings::new(config));
-    let everything = measured.then(Watch::everything);
-    let watches = Watches::new(
-        Arc::clone(&sources.limits),
-        Arc::clone(&sources.events),
-        Arc::clone(&sources.settings),
-        Arc::clone(sources.latest.bell()),
-        Vec::new(),
-        everything.into_iter().collect(),
-    );
+    let sources = MetricSources::new(SourceKind::Replay, Settings::new(config));
+    let everything = measured.then(Watch::everything).into_iter().collect();
+    let watches = sources.watches(Vec::new(), everything);
+    let watches = watches.map_err(io::Error::other)?;
     let settings = observer::Settings {
         // No kernel filter has to be updated first.
         payload_delay: Duration::ZERO,
@@ -245,24 +236,11 @@ fn assemble(
         directed: false,
         ..observer::Settings::default().with_limits(&config.limits)
     };
+    // `rp bag record` records a capture, not the agent that replays it.
     let components = Components {
-        config,
-        source,
         observer: Observer::new(settings),
-        sources,
-        spans: Arc::default(),
-        node_logs: Arc::default(),
-        watches: Arc::new(watches.map_err(io::Error::other)?),
-        state_writer: None,
-        // `rp bag record` records a capture, not the agent that replays it.
-        recordings: None,
-        receipts: None,
-        library: Arc::new(Library::new(Sources::default())),
-        history: Duration::ZERO,
-        restart: None,
-        addresses: Vec::new(),
-        doctor: crate::doctor::of_agent(),
         stop,
+        ..Components::of_replay(config, replay, sources, watches, crate::doctor::of_agent())
     };
     components.assemble().map_err(io::Error::other)
 }

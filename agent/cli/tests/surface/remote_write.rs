@@ -33,7 +33,8 @@ fn sending_to(url: &str, directory: &Path, more: &str) -> LocalAgent {
          labels: {{site: hall2}}{more}}}\n"
     );
     std::fs::write(&configuration, yaml).unwrap();
-    LocalAgent::start(&mut rp(), &["--config", configuration.to_str().unwrap()])
+    let configuration = configuration.to_str().unwrap();
+    LocalAgent::start(&mut rp(), &["--config", configuration, "--watch", "/**"])
 }
 
 fn requests(outcome: &str) -> String {

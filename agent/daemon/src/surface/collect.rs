@@ -19,12 +19,14 @@ use super::ros2_metrics::{self, TopicRows};
 use super::service_metrics;
 use super::{link_metrics, robot_metrics, zenoh_metrics};
 use crate::agent_facts::SourceKind;
+use crate::config::Watch;
 use crate::disk_history::DiskHistory;
 use crate::events::{AgentEvent, EventLog};
 use crate::limit_facts::LimitFigures;
 use crate::recording::RecordingFigures;
 use crate::settings_cell::{Settings, SettingsCell};
 use crate::snapshot_cell::SnapshotCell;
+use crate::watches::{Refused, Watches};
 use ros2probe_metrics::metric_sink::MetricSink;
 use ros2probe_metrics::metric_source::MetricSource;
 use ros2probe_metrics::otlp::{Exports, Signal};
@@ -81,6 +83,28 @@ impl MetricSources {
             disk_history: Arc::default(),
             lost_lines: Arc::default(),
         }
+    }
+
+    /// Creates the watches of the configuration and of the command line, which report to these
+    /// sources.
+    ///
+    /// # Errors
+    ///
+    /// Fails if there are too many watches or globs.
+    pub fn watches(
+        &self,
+        configured: Vec<Watch>,
+        command_line: Vec<Watch>,
+    ) -> Result<Arc<Watches>, Refused> {
+        let watches = Watches::new(
+            Arc::clone(&self.limits),
+            Arc::clone(&self.events),
+            Arc::clone(&self.settings),
+            Arc::clone(self.latest.bell()),
+            configured,
+            command_line,
+        );
+        watches.map(Arc::new)
     }
 
     /// Returns whether traces are exported. Exemplars refer to exported traces.

@@ -360,7 +360,7 @@ crate::tables! {
     /// Unknown writers
     UnknownWriters { name: "unknown_writers", entries: CONFIGURED }
     /// Latest observations of unknown writers
-    LatestUnknown { name: "unknown_writers.latest", entries: 256, rule: Oldest, effect: "is not counted for subscribers" }
+    LatestUnknown { name: "unknown_writers.latest", entries: 256, rule: Oldest, effect: "the oldest is not counted for subscribers" }
     /// Samples of one writer that wait for lower numbers
     OrderedSamples { name: "in_order.waiting", entries: 4097, effect: "the lower numbers are given up" }
     /// Sample numbers of one writer that is not announced yet

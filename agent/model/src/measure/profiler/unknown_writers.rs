@@ -72,20 +72,24 @@ impl Profiler {
         self.observe(observation, journal, graph)
     }
 
-    /// Counts for its subscribers what a writer sent shortly before its announcement, and after
-    /// `since`. HDDS announces a writer to a new participant while it already sends its history
-    /// there.
+    /// Counts for its subscribers what a writer sent shortly before its announcement at `now`, as
+    /// far as they were known. HDDS announces a writer to a new participant while it already sends
+    /// its history there.
     pub fn deliver_earlier(
         &mut self,
         guid: Guid,
-        (since, now): (ModelTime, ModelTime),
+        now: ModelTime,
         journal: &mut Journal,
         graph: &Graph,
     ) {
         let Some(measured) = self.writers.get_mut(&guid) else {
             return;
         };
-        let since = since.max(now - UNKNOWN_AFTER);
+        let topic = measured.topic.and_then(|topic| graph.topics.get(topic));
+        let Some(topic) = topic.filter(|topic| !topic.readers.is_empty()) else {
+            return;
+        };
+        let since = topic.reader_appeared.max(now - UNKNOWN_AFTER);
         let writer_ref = measured.writer_ref(guid);
         for observation in self.latest_unknown.take() {
             let head = observation.head();

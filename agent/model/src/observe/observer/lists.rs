@@ -232,12 +232,10 @@ impl Observer {
                         self.derive.services.note_measured();
                     }
                     let (traits, opened) = (traits(guid, endpoint), topic.reader_appeared);
-                    let (profiler, has_readers) =
-                        (&mut self.measure.profiler, !topic.readers.is_empty());
-                    let was_unknown = profiler.measure(guid, id, traits, opened, now);
-                    if was_unknown && has_readers {
+                    let profiler = &mut self.measure.profiler;
+                    if profiler.measure(guid, id, traits, opened, now) {
                         let journal = &mut self.journal;
-                        profiler.deliver_earlier(guid, (opened, now), journal, &self.graph);
+                        profiler.deliver_earlier(guid, now, journal, &self.graph);
                     }
                 } else {
                     self.retire(guid, now);

@@ -1,8 +1,6 @@
 //! Requests for the history on a storage that does not answer.
 
 use std::path::Path;
-use std::sync::Arc;
-use std::time::Duration;
 
 use axum::Extension;
 use axum::body::Body;
@@ -11,10 +9,7 @@ use hyper::service::Service as _;
 use hyper_util::service::TowerToHyperService;
 use ros2probe_api::doctor::{Report, Severity};
 use ros2probe_capture::reassembly::Limits;
-use ros2probe_message::{Library, Sources};
-use ros2probe_model::observe::observer::{self, Observer};
 use ros2probe_testing::repository;
-use tokio_util::sync::CancellationToken;
 
 use super::super::security::Rights;
 use super::super::{Context, Doctor, nouns};
@@ -22,11 +17,9 @@ use super::query::{MAX_READERS, READER_PERMITS};
 use crate::agent::{Components, Expansion, Speed};
 use crate::agent_facts::SourceKind;
 use crate::config::{Access, Config};
-use crate::run::Source;
 use crate::run::replay::Replay;
 use crate::settings_cell::Settings;
 use crate::surface::MetricSources;
-use crate::watches::Watches;
 
 /// Returns the context of an agent with a history in this directory.
 fn context(directory: &Path) -> Context {
@@ -36,37 +29,14 @@ fn context(directory: &Path) -> Context {
     let replay = Replay::open(&capture, Expansion::Limited, Speed::Max, limits).unwrap();
     let sources = MetricSources::new(SourceKind::Replay, Settings::new(&config));
     sources.disk_history.keep_in(directory, 1 << 20);
-    let watches = Watches::new(
-        Arc::clone(&sources.limits),
-        Arc::clone(&sources.events),
-        Arc::clone(&sources.settings),
-        Arc::clone(sources.latest.bell()),
-        Vec::new(),
-        Vec::new(),
-    );
-    let components = Components {
-        config: &config,
-        source: Source::Replay(Box::new(replay)),
-        observer: Observer::new(observer::Settings::default()),
-        sources,
-        spans: Arc::default(),
-        node_logs: Arc::default(),
-        watches: Arc::new(watches.unwrap()),
-        state_writer: None,
-        recordings: None,
-        receipts: None,
-        library: Arc::new(Library::new(Sources::default())),
-        history: Duration::ZERO,
-        restart: None,
-        addresses: Vec::new(),
-        doctor: Doctor::new(|_| Report {
-            version: "".into(),
-            subject: String::new(),
-            severity: Severity::Ok,
-            findings: Vec::new(),
-        }),
-        stop: CancellationToken::new(),
-    };
+    let watches = sources.watches(Vec::new(), Vec::new()).unwrap();
+    let doctor = Doctor::new(|_| Report {
+        version: "".into(),
+        subject: String::new(),
+        severity: Severity::Ok,
+        findings: Vec::new(),
+    });
+    let components = Components::of_replay(&config, replay, sources, watches, doctor);
     components.assemble().unwrap().context
 }
 
