@@ -250,7 +250,34 @@ fn observed_link(number: u32, verdict: Verdict) -> (Observed, Link, Talker, Guid
         ))
         .unwrap();
     }
+    for (from, to) in [
+        (
+            link.robot.address().to_string(),
+            link.monitor.address().to_string(),
+        ),
+        ("[fd99::1]".to_owned(), "[fd99::2]".to_owned()),
+    ] {
+        wait_for_link(&link, &from, &to);
+    }
     let (talker, writer) = talker(number);
     observed.filter.set_interest(writer, Some(verdict)).unwrap();
     (observed, link, talker, writer)
+}
+
+/// Waits until a datagram arrives: the kernel notices a new carrier later, and until the link
+/// address is resolved, datagrams wait in a short queue of the sender.
+fn wait_for_link(link: &Link, from: &str, to: &str) {
+    let bind = |host: &Namespace, address: &str| {
+        let bind = || UdpSocket::bind(format!("{address}:0")).unwrap();
+        netns::within(&host.network(), bind).unwrap()
+    };
+    let (sender, receiver) = (bind(&link.robot, from), bind(&link.monitor, to));
+    let interval = Duration::from_millis(100);
+    receiver.set_read_timeout(Some(interval)).unwrap();
+    let is_received = (0..100).any(|_| {
+        // Fails while the link has no carrier.
+        let _ = sender.send_to(&[0], receiver.local_addr().unwrap());
+        receiver.recv(&mut [0]).is_ok()
+    });
+    assert!(is_received, "{to}");
 }
