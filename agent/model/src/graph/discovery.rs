@@ -2,9 +2,10 @@
 //!
 //! Identities come from payloads, because a packet's sender may relay announcements of others. A
 //! participant is removed, with its endpoints and nodes, when it is disposed or its lease expires.
-//! A repeated announcement of a participant does not change its endpoints. Every table is capped.
-//! In a full table, a new entry replaces only silent entries or entries with a lower priority.
-//! Forged announcements therefore do not displace real entries.
+//! The lease of one that only others have announced does not expire: they announce it once, and
+//! dispose of it. A repeated announcement of a participant does not change its endpoints. Every
+//! table is capped. In a full table, a new entry replaces only silent entries or entries with a
+//! lower priority. Forged announcements therefore do not displace real entries.
 
 mod disposals;
 mod endpoints;
@@ -270,10 +271,15 @@ impl Discovery {
         if self.disposals.is_stale(guid, origin) {
             return;
         }
-        let (domain_id, source) = domain(announcement.domain_id, origin);
+        let (domain_id, source) = domain(announcement, origin);
+        let relayed = origin.sender != guid.prefix;
         let proxy = ParticipantProxy::of(announcement);
         if let Some(participant) = self.participants.get_mut(&guid.prefix) {
             participant.seen(origin.at);
+            if participant.relayed && !relayed {
+                participant.relayed = false;
+                self.revision += 1;
+            }
             let addresses = Addresses::of(announcement);
             if participant.addresses != addresses {
                 participant.addresses = addresses;
@@ -307,6 +313,7 @@ impl Discovery {
             watched: 0,
             local: false,
             came_by_tcp: false,
+            relayed,
             sends: false,
             domain_source: source,
             nodes_from: None,

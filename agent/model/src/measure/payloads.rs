@@ -584,9 +584,10 @@ impl WantedWriter {
         missed.into_iter().map(dispatches).collect()
     }
 
-    /// Returns the ids without those of requests to which a sample is not dispatched: those that
-    /// received it as the one from before their start, and those that begin with a later one.
-    /// Polling may notice a sample after later ones were seen by other means.
+    /// Returns these ids of requests, without the requests for which `is_left` returns true: those
+    /// that a sample does not concern. Either the request has received this sample already, as the
+    /// one from before its start. Or its first sample is a later one, and polling noticed this one
+    /// late.
     fn without(&self, to: &Arc<[u64]>, is_left: impl Fn(&RequestBegin) -> bool) -> Arc<[u64]> {
         let is_left = |begin: &&RequestBegin| is_left(begin);
         if !self.begins.iter().any(|begin| is_left(&begin)) {

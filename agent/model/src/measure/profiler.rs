@@ -364,6 +364,7 @@ impl Profiler {
             && let Some(mut measured) = self.writers.remove(&before)
         {
             measured.writer.rename(guid);
+            self.rename_latest(before, guid);
             self.unknown_writers.remove(&before);
             self.unknown_writers.insert(guid);
             self.writers.insert(guid, measured);

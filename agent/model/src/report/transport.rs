@@ -135,7 +135,7 @@ pub(crate) fn transport(discovery: &Discovery, writer: Guid, reader: Guid) -> Op
         true => Transport::Tcp,
         false => Transport::Network,
     };
-    if vendor != other || !is_one_host(discovery, vendor, writer.prefix, reader.prefix) {
+    if vendor != other {
         return Some(network());
     }
     let shared_memory = |guid: Guid, endpoint: &Endpoint| {
@@ -143,15 +143,19 @@ pub(crate) fn transport(discovery: &Discovery, writer: Guid, reader: Guid) -> Op
         let default = participant.is_some_and(|known| known.proxy.shared_memory);
         endpoint.shared_memory.unwrap_or(default)
     };
-    Some(if of_writer.data_sharing && of_reader.data_sharing {
+    let within_host = if of_writer.data_sharing && of_reader.data_sharing {
         Transport::DataSharing
     } else if !(shared_memory(writer, of_writer) && shared_memory(reader, of_reader)) {
-        network()
+        return Some(network());
     } else if vendor == VendorId::EPROSIMA {
         Transport::SharedMemory
     } else {
         Transport::Iceoryx
-    })
+    };
+    match is_one_host(discovery, vendor, writer.prefix, reader.prefix) {
+        true => Some(within_host),
+        false => Some(network()),
+    }
 }
 
 /// Returns the implementation of a participant.
@@ -173,17 +177,21 @@ fn is_one_process(discovery: &Discovery, one: GuidPrefix, other: GuidPrefix) -> 
 
 /// Returns whether both participants consider each other to be on one host. Fast DDS 3.2 and later
 /// compares the ids of the machines, earlier ones the first four bytes of the prefixes, which hold
-/// vendor and host. Only participants that announce shared memory are compared.
+/// vendor and host. Others announce no host, so participants without a common address are on two,
+/// unless both send from this host. Only participants that announce shared memory are compared.
 fn is_one_host(
     discovery: &Discovery,
     vendor: VendorId,
     one: GuidPrefix,
     other: GuidPrefix,
 ) -> bool {
-    if vendor != VendorId::EPROSIMA {
-        return true;
-    }
     let participants = discovery.participants();
+    if vendor != VendorId::EPROSIMA {
+        let ends = participants.get(&one).zip(participants.get(&other));
+        return ends.is_none_or(|(one, other)| {
+            one.local && other.local || !one.addresses.are_apart(&other.addresses)
+        });
+    }
     let machine = |prefix| participants.get(&prefix)?.proxy.machine_id.as_ref();
     match (machine(one), machine(other)) {
         (Some(one), Some(other)) => one == other,

@@ -7,11 +7,11 @@ use ros2probe_wire::Guid;
 
 const IMAGE: &str = "sensor_msgs::msg::dds_::Image_";
 
-/// Announces a writer of Alice and a reader of Bob, both of Cyclone DDS. Kind 16 of a locator is
-/// iceoryx in version 0.10, and a PSMX plugin such as `psmx_iox2` in version 11.
-fn image(kinds: [u32; 2]) -> TopicFacts {
+/// Announces a writer of Alice, and a reader of Bob at this address, both of Cyclone DDS. Kind 16
+/// of a locator is iceoryx in version 0.10, and a PSMX plugin such as `psmx_iox2` in version 11.
+fn image(kinds: [u32; 2], bob: &str) -> TopicFacts {
     let mut host = Host::new();
-    host.bystander(BOB, 7411);
+    host.participant(BOB, bob.parse().unwrap());
     let ends = [
         (Guid::new(ALICE, WRITER), SEDP_WRITERS),
         (Guid::new(BOB, READER), SEDP_READERS),
@@ -32,14 +32,27 @@ fn image(kinds: [u32; 2]) -> TopicFacts {
 // Coverage: PSMX, such as `psmx_iox2` | Cyclone DDS 11.0 | - | named
 #[test]
 fn a_pair_of_cyclone_dds_in_shared_memory_is_named_and_has_no_rate() {
-    let topic = image([16, 16]);
+    let topic = image([16, 16], "10.0.0.1:7413");
     let [pairs] = &topic.transports[..] else {
         panic!("{:?}", topic.transports)
     };
     assert_eq!((pairs.transport, pairs.pairs), (Transport::Iceoryx, 1));
     assert_eq!(topic.rate_hz(), None);
     // One end without it uses the network.
-    let topic = image([16, 1]);
+    let topic = image([16, 1], "10.0.0.1:7413");
     assert_eq!(topic.transports[0].transport, Transport::Network);
     assert_eq!(topic.rate_hz(), Some(0.0));
+}
+
+#[test]
+fn a_pair_of_cyclone_dds_with_shared_memory_on_two_hosts_uses_the_network() {
+    let topic = image([16, 16], "10.0.0.2:7411");
+    let [pairs] = &topic.transports[..] else {
+        panic!("{:?}", topic.transports)
+    };
+    assert_eq!((pairs.transport, pairs.pairs), (Transport::Network, 1));
+    assert_eq!(topic.rate_hz(), Some(0.0));
+    // An address that other hosts cannot reach shows no host.
+    let topic = image([16, 16], "127.0.0.1:7411");
+    assert_eq!(topic.transports[0].transport, Transport::Iceoryx);
 }

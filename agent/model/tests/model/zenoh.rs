@@ -112,6 +112,30 @@ fn a_message_on_two_connections_counts_once_and_reaches_only_the_peer() {
     assert_eq!(snapshot.participants.len(), 2);
 }
 
+#[test]
+fn messages_before_the_token_of_their_writer_count_for_its_subscriber() {
+    let mut observer = observer();
+    connect(&mut observer, 1001, TALKER, (LISTENER, Role::Peer));
+    subscribe(&mut observer, 1001, LISTENER);
+    let token = publisher(TALKER, 10, "/chatter");
+    let gid = Gid::of_token(&token).0;
+    let [there, _] = connection(1001);
+    let named = frame(7, &[declare_key(3, KEY)]);
+    send(&mut observer, &there, START, &named);
+    for number in 1..=20 {
+        if number == 11 {
+            let declared = frame(8, &[declare_token(1, &token)]);
+            send(&mut observer, &there, START + number, &declared);
+        }
+        let batch = frame(9, &[push(3, gid, number, b"\0\x01\0\0")]);
+        send(&mut observer, &there, START + number, &batch);
+    }
+    assert_eq!(messages(&observer), 20);
+    let snapshot = observer.snapshot(Timestamp(START + SECOND));
+    let received = chatter(&snapshot).unwrap().received.as_deref().unwrap();
+    assert_eq!((received.messages, received.lost()), (20, 0));
+}
+
 /// The talker and a listener open a connection to each other at the same time. They keep both.
 fn twice_connected() -> (Observer, [u8; 16]) {
     let mut observer = observer();

@@ -95,9 +95,22 @@ impl Addresses {
     /// Returns the first one that other hosts can reach.
     #[must_use]
     pub fn reachable(&self) -> Option<IpAddr> {
-        let mut all = self.metatraffic.iter().chain(&self.default);
-        let first = all.find(|address| !address.ip().is_loopback());
-        first.map(SocketAddr::ip)
+        self.hosts().next()
+    }
+
+    /// Returns whether both have addresses that other hosts can reach, and none in common.
+    #[must_use]
+    pub fn are_apart(&self, other: &Self) -> bool {
+        let has_both = self.reachable().is_some() && other.reachable().is_some();
+        let is_common = |address: IpAddr| other.hosts().any(|each| each == address);
+        has_both && !self.hosts().any(is_common)
+    }
+
+    /// Returns the addresses that other hosts can reach.
+    fn hosts(&self) -> impl Iterator<Item = IpAddr> + '_ {
+        let all = self.metatraffic.iter().chain(&self.default);
+        let all = all.map(SocketAddr::ip);
+        all.filter(|address| !address.is_loopback())
     }
 }
 
@@ -126,6 +139,8 @@ pub struct Participant {
     pub(crate) local: bool,
     /// Whether one of its messages came by TCP.
     pub(super) came_by_tcp: bool,
+    /// Whether only others have announced it, such as a Discovery Server.
+    pub(super) relayed: bool,
     /// Whether it has sent user data.
     pub(super) sends: bool,
     pub(super) domain_source: DomainSource,
@@ -233,13 +248,14 @@ impl Participant {
         self.last_seen = self.last_seen.max(at);
     }
 
-    /// Returns the end of its lease if no further packet arrives; `None` means never.
+    /// Returns the end of its lease if no further packet arrives; `None` means never. A Discovery
+    /// Server relays an announcement once, and disposes of the participant when its lease ends.
     pub(super) fn lease_end(&self) -> Option<ModelTime> {
         let lease = match self.proxy.lease {
-            RtpsDuration::Finite(lease) => lease,
-            // The participant may have stopped while no agent ran, so its infinite lease is
+            RtpsDuration::Finite(lease) if !self.relayed => lease,
+            // The participant may have stopped while no agent ran, so a lease without an end is
             // limited.
-            RtpsDuration::Infinite => self.restored.map(|_| MAX_SILENCE)?,
+            _ => self.restored.map(|_| MAX_SILENCE)?,
         };
         Some(self.last_seen + lease)
     }
@@ -295,28 +311,60 @@ pub(super) fn named(nodes: &[Node]) -> usize {
 }
 
 /// Returns the participant's domain and its source. Without an announced domain, it follows from
-/// the destination port of discovery (RTPS 2.5, 9.6.2.3). For domain d, the multicast port of
-/// discovery is 7400 + 250 d, and its unicast ports are 7410 + 250 d + 2 p. Ports of 32768 and
-/// above are mostly ephemeral, so the domain is then assumed to be 0.
-pub(super) fn domain(announced: Option<DomainId>, origin: &Origin) -> (DomainId, DomainSource) {
-    const FIRST_EPHEMERAL_PORT: u16 = 32_768;
+/// the ports of discovery (RTPS 2.5, 9.6.2.3). The destination may be another participant: a client
+/// of a Discovery Server announces itself at the server's port, which users choose. So the
+/// participant's own unicast ports come first. A server itself has none that follows from a domain.
+pub(super) fn domain(
+    announcement: &ParticipantAnnouncement,
+    origin: &Origin,
+) -> (DomainId, DomainSource) {
+    let announced = announcement.domain_id;
     if let Some(domain_id) = announced.filter(|domain_id| *domain_id <= DomainId::MAX) {
         return (domain_id, DomainSource::Announced);
     }
-    let Some(offset) = origin.port.checked_sub(DomainId::PORT_BASE) else {
-        return (DomainId(0), DomainSource::Assumed);
-    };
-    let domain_id = DomainId(u32::from(offset / DomainId::PORT_GAIN));
-    let rest = offset % DomainId::PORT_GAIN;
     let [first, .., a, _, _, _] = origin.destination;
     let is_multicast = first == 0xff || first == 0 && a & 0xf0 == 0xe0;
-    if is_multicast && rest == 0 && domain_id <= DomainId::MAX {
+    if let Some(domain_id) = of_multicast(origin.port).filter(|_| is_multicast) {
         return (domain_id, DomainSource::MulticastPort);
     }
-    if rest >= 10 && rest.is_multiple_of(2) && origin.port < FIRST_EPHEMERAL_PORT {
-        return (domain_id, DomainSource::UnicastPort);
+    let own = || {
+        let locators = announcement.metatraffic_unicast.iter();
+        locators.filter_map(Locator::udp)
+    };
+    let domain_id = match own().next() {
+        Some(_) if !is_discovery_server(announcement.guid.prefix) => {
+            own().find_map(|address| of_unicast(address.port()))
+        }
+        _ => of_unicast(origin.port),
+    };
+    match domain_id {
+        Some(domain_id) => (domain_id, DomainSource::UnicastPort),
+        None => (DomainId(0), DomainSource::Assumed),
     }
-    (DomainId(0), DomainSource::Assumed)
+}
+
+/// Returns the domain of a multicast port of discovery, which is 7400 + 250 d for domain d.
+fn of_multicast(port: u16) -> Option<DomainId> {
+    let offset = port.checked_sub(DomainId::PORT_BASE)?;
+    let domain_id = DomainId(u32::from(offset / DomainId::PORT_GAIN));
+    let is_base = offset.is_multiple_of(DomainId::PORT_GAIN);
+    (is_base && domain_id <= DomainId::MAX).then_some(domain_id)
+}
+
+/// Returns the domain of a unicast port of discovery, which is 7410 + 250 d + 2 p for domain d and
+/// participant p. Ports of 32768 and above are mostly ephemeral.
+fn of_unicast(port: u16) -> Option<DomainId> {
+    const FIRST_EPHEMERAL_PORT: u16 = 32_768;
+    let offset = port.checked_sub(DomainId::PORT_BASE)?;
+    let rest = offset % DomainId::PORT_GAIN;
+    let is_discovery = rest >= 10 && rest.is_multiple_of(2) && port < FIRST_EPHEMERAL_PORT;
+    is_discovery.then(|| DomainId(u32::from(offset / DomainId::PORT_GAIN)))
+}
+
+/// Returns whether this is the prefix of a Discovery Server of Fast DDS 2.x, which users choose by
+/// number: `44.53.NN.5f.45.50.52.4f.53.49.4d.41`.
+fn is_discovery_server(prefix: GuidPrefix) -> bool {
+    matches!(&prefix.0, [b'D', b'S', _, name @ ..] if name == b"_EPROSIMA")
 }
 
 impl Endpoint {

@@ -117,20 +117,43 @@ impl Zenoh {
         if self.opposite(stream).is_some_and(|other| other.has_left) {
             return;
         }
-        if let Some(session) = session {
-            let mut others = self.directions.iter();
-            let is_open = others.any(|(id, direction)| {
-                direction.session() == Some(session) && self.is_open(id, direction)
-            });
-            if !is_open && !self.remembered.has(session) {
-                self.graph.end(session);
-            }
+        if let Some(session) = session.filter(|session| !self.has_connection(*session)) {
+            self.graph.end(session);
         }
         if let Some(direction) = self.directions.get(stream)
             && !self.is_shared(direction, |other| !other.has_left)
         {
             self.graph.leave(direction.number);
         }
+    }
+
+    /// Ends the sessions that discovery does not know, if they have no open connection and none
+    /// declares their tokens. If others closed all connections of a session first, only its lease
+    /// ends it.
+    pub fn end_expired(&mut self, is_known: impl Fn(ZenohId) -> bool) {
+        let sessions = self.graph.sessions();
+        let unknown: Vec<_> = sessions.filter(|session| !is_known(*session)).collect();
+        for session in unknown {
+            let declarers = self.graph.declarers(session);
+            let mut directions = self.directions.iter();
+            let is_declared = directions.any(|(stream, direction)| {
+                declarers.contains(&direction.number) && self.is_open(stream, direction)
+            });
+            if !is_declared && !self.has_connection(session) {
+                self.graph.end(session);
+                self.revision += 1;
+            }
+        }
+    }
+
+    /// Returns whether a session has an open connection, or may have one that has not been seen
+    /// since a restart.
+    fn has_connection(&self, session: ZenohId) -> bool {
+        let mut directions = self.directions.iter();
+        let is_open = directions.any(|(stream, direction)| {
+            direction.session() == Some(session) && self.is_open(stream, direction)
+        });
+        is_open || self.remembered.has(session)
     }
 
     /// Returns whether a direction shares its declarations with such another one.

@@ -111,6 +111,19 @@ impl Profiler {
         }
     }
 
+    /// Replaces the GUID of an unknown writer in its latest observations, so that
+    /// [`Self::deliver_earlier`] finds them. Only writers of Zenoh are renamed, and these only send
+    /// samples.
+    pub(super) fn rename_latest(&mut self, before: Guid, guid: Guid) {
+        for observation in &mut self.latest_unknown {
+            if let Observation::Sample(sample) = observation
+                && sample.head.writer == before
+            {
+                sample.head.writer = guid;
+            }
+        }
+    }
+
     /// Drops the unknown writer with the longest silence that is not established. Returns whether
     /// there was one.
     fn evict_unknown_writer(&mut self, now: ModelTime, graph: &Graph) -> bool {

@@ -4,7 +4,7 @@ use foldhash::{HashMap, HashMapExt as _};
 use ros2probe_wire::discovery::{EndpointAnnouncement, Role};
 use ros2probe_wire::record::Verdict;
 use ros2probe_wire::rtps::{StatusInfo, VendorId};
-use ros2probe_wire::zenoh::Gid;
+use ros2probe_wire::zenoh::{Gid, ZenohId};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, RtpsTime, SequenceNumber};
 
 use super::Observer;
@@ -112,9 +112,12 @@ impl Observer {
         }
     }
 
-    /// Ends the sessions of Zenoh that a router no longer reaches.
+    /// Ends the sessions of Zenoh that a router no longer reaches, and those whose lease has ended.
     pub(super) fn end_unreachable_sessions(&mut self, now: ModelTime) {
         self.zenoh.end_unreachable(now);
+        let discovery = &self.graph.discovery;
+        let is_known = |session: ZenohId| discovery.knows(session.guid_prefix());
+        self.zenoh.end_expired(is_known);
         self.change_zenoh_graph(now);
     }
 

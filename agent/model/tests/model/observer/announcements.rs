@@ -1,9 +1,10 @@
 //! Discovery data: repeated, fragmented, relayed, malformed; names of nodes.
 
+use ros2probe_model::graph::discovery::Memory;
 use ros2probe_model::observe::input::Input;
 use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS, SPDP};
 use ros2probe_wire::qos::Reliability;
-use ros2probe_wire::{EntityId, GuidPrefix};
+use ros2probe_wire::{EntityId, GuidPrefix, Timestamp};
 
 use super::{ALICE, BOB, NODES, OTHER, STRING, WRITER, World, alice, bob};
 
@@ -108,6 +109,44 @@ fn announcements_relayed_by_a_discovery_server_apply_to_their_participant() {
     assert_eq!(snapshot.participants[0].guid, alice(EntityId::PARTICIPANT));
     assert_eq!(world.measurement("/chatter").messages, 10);
     world.put(Message::from(server).dispose_by_hash(SPDP, 2, alice(EntityId::PARTICIPANT)));
+    assert!(world.snapshot().participants.is_empty());
+}
+
+#[test]
+fn a_participant_that_a_discovery_server_announced_once_stays_until_it_is_disposed() {
+    let server = GuidPrefix(*b"DS\x00_EPROSIMA");
+    let mut world = World::new(&["/**"]);
+    let relayed = |message: Message| message.data(SPDP, 1, &forge::participant(ALICE, 20, None));
+    world.put(relayed(Message::from(server)));
+    world.sedp(alice(WRITER), "rt/chatter");
+    world.wait(60_000);
+    assert_eq!(world.snapshot().participants.len(), 1);
+    let memory = serde_json::to_string(&world.observer.memory()).unwrap();
+    world.put(Message::from(server).dispose_by_hash(SPDP, 2, alice(EntityId::PARTICIPANT)));
+    assert!(world.snapshot().participants.is_empty());
+
+    // A restarted agent cannot know that the server disposed of a participant in the meantime.
+    let memory: Memory = serde_json::from_str(&memory).unwrap();
+    let mut restarted = World::new(&["/**"]);
+    restarted.now = world.now;
+    let now = Timestamp(restarted.now);
+    restarted.observer.input(Input::Restored {
+        memory: &memory,
+        now,
+    });
+    restarted.wait(60_000);
+    assert_eq!(restarted.snapshot().participants.len(), 1);
+    restarted.wait(31_000);
+    assert!(restarted.snapshot().participants.is_empty());
+
+    // The last announcement counts: a direct one brings the lease back.
+    let mut world = World::new(&["/**"]);
+    for sender in [server, ALICE, server] {
+        world.put(relayed(Message::from(sender)));
+    }
+    world.wait(19_000);
+    assert_eq!(world.snapshot().participants.len(), 1);
+    world.wait(2000);
     assert!(world.snapshot().participants.is_empty());
 }
 

@@ -4,7 +4,7 @@ use ros2probe_model::observe::input::Input;
 use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS, SPDP};
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::walk::Envelope;
-use ros2probe_wire::{DomainId, EntityId, Timestamp};
+use ros2probe_wire::{DomainId, EntityId, GuidPrefix, Timestamp};
 
 use super::{ALICE, BOB, OTHER, READER, WRITER, World, alice, bob};
 
@@ -29,6 +29,58 @@ fn topics_of_two_domains_are_counted_separately() {
             .unwrap()
     };
     assert_eq!((messages(0).messages, messages(5).messages), (100, 500));
+}
+
+/// Returns the SPDP payload of a participant that does not announce its domain, with this unicast
+/// port of its discovery endpoints.
+fn with_discovery_port(prefix: GuidPrefix, port: u16) -> Vec<u8> {
+    let mut payload = forge::participant(prefix, 10, None);
+    // Before the sentinel.
+    payload.truncate(payload.len() - 4);
+    let locator = [
+        &[0x32, 0, 24, 0, 1, 0, 0, 0][..],
+        &u32::from(port).to_le_bytes(),
+        &[0; 12],
+        &[10, 0, 0, 1],
+    ]
+    .concat();
+    payload.extend(locator);
+    payload.extend([1, 0, 0, 0]);
+    payload
+}
+
+/// Returns the domains of the participants after this announcement arrived at a unicast port.
+fn domains(prefix: GuidPrefix, payload: &[u8], destination_port: u16) -> Vec<u32> {
+    let mut world = World::new(&[]);
+    let envelope = Envelope {
+        destination: [0; 16],
+        destination_port,
+        ..forge::multicast(world.now, 0)
+    };
+    world.observer.input(Input::Datagram {
+        envelope: &envelope,
+        payload: &Message::from(prefix).data(SPDP, 1, payload).bytes(),
+        handover: None,
+    });
+    let participants = world.snapshot().participants.into_iter();
+    participants.map(|each| each.domain_id.0).collect()
+}
+
+#[test]
+fn the_port_of_a_discovery_server_does_not_decide_the_domain_of_its_clients() {
+    // Port 11888 is that of a participant in domain 17.
+    let client = |port| domains(ALICE, &with_discovery_port(ALICE, port), 11_888);
+    assert_eq!(client(7410), [0]);
+    assert_eq!(client(7410 + 42 * 250), [42]);
+    // A port of its own that is in no domain's range shows no domain.
+    assert_eq!(client(45_000), [0]);
+    // Without one, the destination decides.
+    let silent = forge::participant(ALICE, 10, None);
+    assert_eq!(domains(ALICE, &silent, 7412 + 5 * 250), [5]);
+    // The server announces itself to a client.
+    let server = GuidPrefix(*b"DS\x00_EPROSIMA");
+    let payload = with_discovery_port(server, 11_888);
+    assert_eq!(domains(server, &payload, 7412 + 42 * 250), [42]);
 }
 
 #[test]

@@ -422,3 +422,43 @@ fn tokens_that_a_router_no_longer_lists_end_with_the_next_command() {
     host.send(&back, &frame(9, &[answer_end(1)]));
     assert_eq!(host.listed(), [true, false, true]);
 }
+
+#[test]
+fn sessions_whose_connections_others_closed_leave_no_tokens_after_their_lease() {
+    let mut host = Host::observed(START);
+    let tokens = |host: &Host| {
+        let tables = host.observer.snapshot(Timestamp(host.now)).tables;
+        let mut tables = tables.into_iter();
+        tables
+            .find(|table| table.table == "zenoh_tokens")
+            .unwrap()
+            .size
+    };
+    for restart in 1..=5_u8 {
+        let session = [0x90 + restart; 16];
+        let port = 1000 + u16::from(restart);
+        let [to_router, from_router] = within([port, 7447], [200 + u64::from(restart), 71]);
+        let router = (ROUTER, Role::Router);
+        host.connect([to_router, from_router], (session, Role::Peer), router);
+        host.declare(&to_router, 1, &publisher(session, 10, "/chatter"));
+        host.declare(&to_router, 2, &publisher(session, 11, "/other"));
+        for stream in [from_router, to_router] {
+            report(&mut host.observer, &stream, host.now, StreamEvent::End);
+        }
+        host.pass(55);
+        assert_eq!((tokens(&host), host.has(session)), (2, true), "{restart}");
+        host.pass(6);
+        assert_eq!((tokens(&host), host.has(session)), (0, false), "{restart}");
+    }
+}
+
+#[test]
+fn tokens_of_a_silent_session_stay_while_a_connection_declares_them() {
+    let mut host = Host::observed(START);
+    host.step(Step::Listener, &[]);
+    host.pass(120);
+    assert!(!host.has(LISTENER));
+    // Its connection is open, so its next sign of life brings it back.
+    host.send(&of_listener()[0], &[KEEP_ALIVE]);
+    assert!(host.has(LISTENER));
+}
