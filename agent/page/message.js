@@ -201,13 +201,15 @@ function Follow({ scope, name, topic, events }) {
       abort.abort();
     };
   }, [name, scope, run]);
-  // A stream that was opened again, after an agent that was out of reach, has messages again.
+  // A stream that was opened again, after an agent that was out of reach, has messages again. Without
+  // a network, a connection ends without a notice, so its messages begin again in any case.
   const { openings } = state;
   const opened = useRef(openings);
   useEffect(() => {
     if (opened.current === openings) return;
     opened.current = openings;
-    if (problem || end) again((/** @type {number} */ value) => value + 1);
+    // A hidden tab begins again when it is shown.
+    if (document.visibilityState !== 'hidden') again((/** @type {number} */ value) => value + 1);
   }, [openings]);
   const toggle = (/** @type {string} */ path) => {
     const next = new Set(toggled);

@@ -69,6 +69,9 @@ export function replaceAddress(to) {
   window.dispatchEvent(new HashChangeEvent('hashchange'));
 }
 
+/** Longest time until a request that was not sent, or failed, is due again. */
+const RETRY_MS = 10000;
+
 /**
  * Requests something while the tab is visible, and again if it changes with time. The answer stays
  * until the next one of the same path.
@@ -91,9 +94,11 @@ export function useRequest(path, part, every, ask, may) {
     let timer = 0;
     const request = async () => {
       clearTimeout(timer);
+      let wait = Math.min(every, RETRY_MS);
       if (document.visibilityState !== 'hidden' && may()) {
         try {
           take({ path, part, data: await ask(abort.signal), problem: null });
+          wait = every;
         } catch (error) {
           if (abort.signal.aborted) return;
           const problem = error instanceof Refusal ? error : new Refusal(0, String(error));
@@ -101,7 +106,7 @@ export function useRequest(path, part, every, ask, may) {
             data: before.path === path && before.part === part ? before.data : null }));
         }
       }
-      if (every > 0 && !abort.signal.aborted) timer = setTimeout(request, every);
+      if (every > 0 && !abort.signal.aborted) timer = setTimeout(request, wait);
     };
     again.current = request;
     request();

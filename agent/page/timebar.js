@@ -14,8 +14,10 @@ const SPANS = /** @type {[number, string][]} */ ([
 ]);
 const DEFAULT_SPAN = 600;
 const LONGEST_SPAN = 31 * 86400;
-/** Time between two requests for charts whose end is the present. */
+/** Shortest time between two requests for charts whose end is the present. */
 const AGAIN_MS = 10000;
+/** A chart is requested again after this part of its time: one pixel of a small screen. */
+const AGAIN_PARTS = 360;
 
 /** @typedef {{span: number, at: number|null}} Shown seconds, and the Unix time of their end */
 
@@ -62,13 +64,22 @@ export function inWords({ span, at }) {
 }
 
 /**
+ * Returns the milliseconds between two requests for a part of the history: more for a long one, which
+ * takes the agent more reading. Returns 0 if the part ends in the past, which does not change.
+ * @param {Shown} shown
+ */
+export function againAfter({ span, at }) {
+  return at == null ? Math.max(AGAIN_MS, span * 1000 / AGAIN_PARTS) : 0;
+}
+
+/**
  * Requests a part of the history, again while its end is the present.
  * @param {string|null} path null sends no request
  * @param {Shown} shown
  * @param {(path: string, options: RequestInit) => Promise<any>} [ask]
  */
 export function useHistory(path, { span, at }, ask = json) {
-  return useRequest(path, `${span} ${at}`, at == null ? AGAIN_MS : 0, (signal) => {
+  return useRequest(path, `${span} ${at}`, againAfter({ span, at }), (signal) => {
     const to = at ?? Math.floor(state.time);
     return ask(`${path}${path?.includes('?') ? '&' : '?'}from=${to - span}&to=${to}`, { signal });
   }, () => at != null || stream.status === 'live');

@@ -8,7 +8,8 @@ Object.assign(globalThis, {
   document: { addEventListener() {}, visibilityState: 'visible' },
   window: { addEventListener() {} },
 });
-const { eventBefore, eventsOf, inWords, marksOf, showTime, timeOf } = await import('../timebar.js');
+const { againAfter, eventBefore, eventsOf, inWords, marksOf, showTime, timeOf } = await import(
+  '../timebar.js');
 
 test('the time of an address is bounded', () => {
   assert.deepEqual(timeOf({}), { span: 600, at: null });
@@ -35,6 +36,12 @@ test('a change of the time keeps the rest of the address', () => {
   assert.deepEqual(parse(hash())?.query, { domain: '0', span: '3600', at: '1790000000' });
   showTime({ at: null, span: 600 });
   assert.equal(hash(), '#/topics/%2Fa?domain=0');
+});
+
+test('a long time is requested less often, and one of the past once', () => {
+  const seconds = [60, 3600, 86400, 604800].map((span) => againAfter({ span, at: null }) / 1000);
+  assert.deepEqual(seconds, [10, 10, 240, 1680]);
+  assert.equal(againAfter({ span: 604800, at: 1790000000 }), 0);
 });
 
 test('a time is named', () => {

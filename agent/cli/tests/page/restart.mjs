@@ -43,6 +43,15 @@ await scenario(async (open) => {
   await row('/after_restart').getByRole('link').click();
   const message = tab.page.locator('section[aria-labelledby="live"]');
   await reads(message, /number [\d,]+ by \/other/);
+  // No connection breaks, as without a network. The messages begin again with the stream.
+  const followed = () => tab.requests.filter((request) => request.url().includes('/messages?')).length;
+  const earlier = followed();
+  await ask('freeze');
+  await tab.shows('No connection', 'body');
+  await ask('thaw');
+  await tab.live();
+  await until('the messages begin again', async () => followed() > earlier);
+  await reads(message, /number [\d,]+ by \/other/);
   // The next agent does not know the topic before its robot starts.
   tab.expect(/404 .*topics\/%2Fafter_restart/);
   await ask('kill');

@@ -58,6 +58,7 @@ fn each_path_of_the_listener_gets_the_expected_answer() {
     for (path, status, body) in [
         ("/healthz", 200, "ok\n"),
         ("/readyz", 200, "ready\n"),
+        ("/livez", 200, "alive\n"),
         ("/x", 404, "not found; see /\n"),
     ] {
         let answer = agent.get(path);

@@ -56,9 +56,10 @@ fn page_series(page: &str) -> BTreeMap<Labels, f64> {
             .map(|label| {
                 let (name, value) = label.split_once("=\"").unwrap();
                 let value = value.trim_end_matches('"');
-                // Prometheus stores the bound `1` as `1.0`.
+                // Prometheus stores the bound `1` as `1.0`, and `0.00001` as `1e-05`.
                 let bound = value.parse().ok().filter(|bound: &f64| bound.is_finite());
                 let value = match bound.filter(|_| name == "le") {
+                    Some(bound) if bound < 1e-4 => format!("{bound:e}").replace("e-", "e-0"),
                     Some(bound) => format!("{bound:?}"),
                     None => value.to_owned(),
                 };
@@ -165,6 +166,35 @@ fn a_receiver_of_version_1_gets_the_same_series() {
         let retried = ros2probe_testing::local_agent::metric(&page, &requests("retried"));
         assert_eq!(retried, Some(1.0));
     }
+}
+
+#[test]
+fn one_refusal_without_the_version_changes_no_version_and_a_second_one_does() {
+    let directory = tempfile::tempdir().unwrap();
+    let receiver = Receiver::start(Reply::stored);
+    let agent = sending(&receiver, directory.path(), "");
+    receiver.wait_for("samples", |stored| !stored.is_empty());
+    for refusals in [1, 2] {
+        // The portal of a network answers, or a proxy.
+        let mut left = 1;
+        receiver.answer(move |write| match std::mem::take(&mut left) {
+            1 => Reply::status(400),
+            _ => Reply::stored(write),
+        });
+        let expected = f64::from(refusals) - 0.5;
+        agent.wait_for_metric(&requests("retried"), |count| count > expected);
+        let before = receiver.stored().len();
+        receiver.wait_for("samples", |stored| stored.len() > before + 1);
+        assert_eq!(receiver.stored().last().unwrap().version, "2.0.0");
+    }
+    // A receiver of version 1.0 takes the place of the first one.
+    receiver.answer(|write| match write.version.as_str() {
+        "2.0.0" => Reply::status(415),
+        _ => Reply::stored(write),
+    });
+    receiver.wait_for("samples of version 1.0", |stored| {
+        stored.last().is_some_and(|write| write.version == "0.1.0")
+    });
 }
 
 #[test]

@@ -29,11 +29,13 @@ use ros2probe_model::facts::calls::report::{
     CallbackReport, Durations, ProcessReport, PublisherReport, Report, ThreadStates, Transition,
     Trigger,
 };
+use ros2probe_model::facts::model_time::ModelTime;
 use ros2probe_model::observe::input::Input;
 use ros2probe_model::observe::observer::{self, Observer};
-use ros2probe_model::report::snapshot::Snapshot;
+use ros2probe_model::report::snapshot::{DiagnosticStatus, Snapshot};
+use ros2probe_wire::diagnostics::DiagnosticLevel;
 use ros2probe_wire::time::SECOND;
-use ros2probe_wire::{DomainId, Timestamp};
+use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, Timestamp};
 
 /// Reaction of the receiver to a request.
 #[derive(Clone, Copy)]
@@ -295,6 +297,46 @@ async fn metrics_of_calls_inside_processes_are_exported_as_on_the_page() {
         assert!(is_exported, "{name}\n{exported:#?}");
     }
     assert!(count > 15, "{count}");
+}
+
+#[test]
+fn a_repeated_key_of_a_diagnostic_status_is_one_series() {
+    let settings = crate::settings_cell::Settings {
+        diagnostic_values: vec!["battery/*".to_owned()],
+        ..crate::settings_cell::Settings::default()
+    };
+    let sources = MetricSources::new(SourceKind::Host, settings);
+    let value = |key: &str, value: &str| -> (Box<str>, Box<str>) { (key.into(), value.into()) };
+    let status = DiagnosticStatus {
+        domain_id: DomainId(3),
+        topic: "/diagnostics".into(),
+        name: "battery".into(),
+        hardware_id: "".into(),
+        node: None,
+        writer: Guid::new(GuidPrefix([1; 12]), EntityId([0, 0, 1, 3])),
+        level: DiagnosticLevel::Ok,
+        message: "".into(),
+        values: vec![
+            value("Cell", "unknown"),
+            value("Cell", "3.5"),
+            value("Cell", "3.25"),
+            value("Charge", "80"),
+        ],
+        at: ModelTime::default(),
+        since: ModelTime::default(),
+    };
+    let mut snapshot = Snapshot::default();
+    snapshot.diagnostics.statuses = vec![Arc::new(status)];
+    let agent = AgentFacts::new(SourceKind::Host, Instant::now());
+    sources.latest.publish(snapshot, agent);
+    let page = Exposition::new(sources).render(Format::Classic).unwrap();
+    let series = page
+        .lines()
+        .filter(|line| line.starts_with("ros2_diagnostics_value{"));
+    let values: Vec<f64> = series
+        .map(|line| line.rsplit_once(' ').unwrap().1.parse().unwrap())
+        .collect();
+    assert_eq!(values, [3.5, 80.0], "{page}");
 }
 
 async fn until(what: &str, mut holds: impl FnMut() -> bool) {

@@ -40,13 +40,14 @@ const INDEX_PAGE: &str = "<!doctype html><title>ros2probe</title><h1>ros2probe</
 <p>Watches the ROS 2 robot on this host from copies of its traffic.
 <ul><li><a href=\"/metrics\">/metrics</a> for Prometheus
 <li><a href=\"/readyz\">/readyz</a> whether the agent observes the robot: 200, or 503 with the reason
+<li><a href=\"/livez\">/livez</a> whether the capture makes progress: 200, or 503 with the reason
 <li><a href=\"/healthz\">/healthz</a> whether the process runs</ul>
 ";
 
 /// Why the listener cannot be opened.
 #[derive(Debug, thiserror::Error)]
 pub enum ListenError {
-    /// The address is in use or does not belong to this host.
+    /// The address is in use, or is a local one that this host does not have.
     #[error(
         "cannot listen on {address}: change `metrics.listen` in the configuration or pass \
          `--metrics`"
@@ -85,8 +86,7 @@ impl Server {
     /// Binds the address without a runtime. The file `web_config` restricts the clients.
     ///
     /// # Errors
-    /// Fails if the address is in use or does not belong to this host, or if the file cannot be
-    /// applied.
+    /// Fails if the address cannot be bound, or if the file cannot be applied.
     pub fn bind(
         address: SocketAddr,
         web_config: Option<&Path>,
@@ -181,6 +181,7 @@ fn router(sources: MetricSources) -> Router {
         .route("/metrics", get(metrics))
         .route("/healthz", get(async || "ok\n"))
         .route("/readyz", get(readyz))
+        .route("/livez", get(livez))
         .fallback(async || (StatusCode::NOT_FOUND, "not found; see /\n"))
         .method_not_allowed_fallback(async |method: Method| {
             (
@@ -277,9 +278,51 @@ async fn readyz(Extract(pages): Extract<Pages>) -> Response {
     }
 }
 
+/// Answers as the watchdog of the service: a restart would not help an agent whose interface or
+/// control group is gone.
+async fn livez(Extract(pages): Extract<Pages>) -> Response {
+    match pages.latest.own_state().progresses(Instant::now()) {
+        Ok(()) => "alive\n".into_response(),
+        Err(reason) => (StatusCode::SERVICE_UNAVAILABLE, format!("{reason}\n")).into_response(),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::agent_facts::{AgentFacts, SourceKind};
+    use crate::settings_cell::Settings;
+    use ros2probe_model::report::snapshot::Snapshot;
+
+    #[tokio::test]
+    async fn an_agent_without_its_interface_is_alive_but_not_ready() {
+        let sources = MetricSources::new(SourceKind::Wire, Settings::default());
+        let pages = Pages {
+            latest: Arc::clone(&sources.latest),
+            limits: Arc::clone(&sources.limits),
+            exposition: Arc::new(Exposition::new(sources)),
+        };
+        let (ok, unready) = (StatusCode::OK, StatusCode::SERVICE_UNAVAILABLE);
+        let publish = |missing: Option<&str>, begun: Instant| {
+            let agent = AgentFacts {
+                missing_object: missing.map(str::to_owned),
+                ..AgentFacts::new(SourceKind::Wire, begun)
+            };
+            pages.latest.publish(Snapshot::default(), agent);
+        };
+        let status = async || {
+            let ready = readyz(Extract(pages.clone())).await.status();
+            (ready, livez(Extract(pages.clone())).await.status())
+        };
+        assert_eq!(status().await, (unready, unready));
+        publish(None, Instant::now());
+        assert_eq!(status().await, (ok, ok));
+        publish(Some("the interface eth0 is gone"), Instant::now());
+        assert_eq!(status().await, (unready, ok));
+        let stuck = Instant::now().checked_sub(Duration::from_mins(1));
+        publish(None, stuck.unwrap());
+        assert_eq!(status().await, (unready, unready));
+    }
 
     #[test]
     fn a_page_is_compressed_if_the_client_accepts_gzip() {

@@ -41,6 +41,19 @@ impl Places {
             open => open.ok(),
         }
     }
+
+    /// Returns why [`Self::take`] returned no slot for one of these `streams`.
+    pub(super) fn refusal(&self, streams: &str, is_holder: bool) -> String {
+        let all = self.all;
+        if is_holder {
+            return format!("{all} {streams} are open, which is the limit");
+        }
+        let reserved = all / 4;
+        format!(
+            "all {streams} without a token are taken; {reserved} of {all} are for clients with a \
+             token"
+        )
+    }
 }
 
 #[cfg(test)]
@@ -52,8 +65,12 @@ mod tests {
         let places = Places::new(16);
         let strangers: Vec<_> = std::iter::from_fn(|| places.take(false)).collect();
         assert_eq!(strangers.len(), 12);
+        let refusal = places.refusal("streams", false);
+        assert!(refusal.ends_with("4 of 16 are for clients with a token"));
         let owners: Vec<_> = std::iter::from_fn(|| places.take(true)).collect();
         assert_eq!(owners.len(), 4);
+        let refusal = places.refusal("streams", true);
+        assert_eq!(refusal, "16 streams are open, which is the limit");
         drop(strangers);
         // Clients with a token can also take the slots that are not reserved.
         let others: Vec<_> = std::iter::from_fn(|| places.take(true)).collect();

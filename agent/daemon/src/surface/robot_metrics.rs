@@ -46,20 +46,29 @@ pub(super) fn diagnostics(
         Ok(())
     })?;
     sink.family(&metric::DIAGNOSTICS_VALUE, |family| {
-        for status in statuses {
-            for (key, value) in status.values.iter().filter(|_| !wanted.is_empty()) {
+        for status in statuses.iter().filter(|_| !wanted.is_empty()) {
+            for (place, (key, value)) in status.values.iter().enumerate() {
                 let text = format!("{}/{key}", status.name);
-                let number = value.trim().parse::<f64>();
-                let number = number.ok().filter(|_| is_wanted(&text));
-                if let Some(number) = number {
-                    let [domain_id, topic, name, hardware_id] = part(status);
-                    let labels = [domain_id, topic, name, hardware_id, Label::Text(key)];
-                    family.sample(&labels, number)?;
+                let number = number_of(value).filter(|_| is_wanted(&text));
+                let Some(number) = number else {
+                    continue;
+                };
+                // A key may be repeated, but a page has each series once.
+                let mut earlier = status.values.iter().take(place);
+                if earlier.any(|(other, value)| other == key && number_of(value).is_some()) {
+                    continue;
                 }
+                let [domain_id, topic, name, hardware_id] = part(status);
+                let labels = [domain_id, topic, name, hardware_id, Label::Text(key)];
+                family.sample(&labels, number)?;
             }
         }
         Ok(())
     })
+}
+
+fn number_of(value: &str) -> Option<f64> {
+    value.trim().parse().ok()
 }
 
 fn part(status: &DiagnosticStatus) -> [Label<'_>; 4] {

@@ -290,6 +290,7 @@ impl Sender<'_> {
     ) -> Result<(), (String, Option<u64>)> {
         let mut pause = FIRST_PAUSE;
         let mut body = self.body(part);
+        let mut is_doubted = false;
         loop {
             self.reload_files();
             let length = body.len();
@@ -300,6 +301,13 @@ impl Sender<'_> {
                     WriteResult::RetryLater(reason.to_owned(), None)
                 }
                 WriteResult::Unconfirmed => WriteResult::UnknownVersion,
+                // Only a second refusal shows that another receiver took its place.
+                WriteResult::UnknownVersion
+                    if self.is_known && !std::mem::replace(&mut is_doubted, true) =>
+                {
+                    let reason = "a refusal without the number of written samples";
+                    WriteResult::RetryLater(reason.to_owned(), None)
+                }
                 answer => answer,
             };
             let figures = &self.job.figures;

@@ -1,7 +1,7 @@
 //! Samples of one collection, with the names and labels that a scrape of the page has.
 
 use std::collections::HashMap;
-use std::fmt::Write as _;
+use std::fmt::{self, Write as _};
 use std::sync::Arc;
 
 use ros2probe_model::facts::histogram::Histogram;
@@ -121,10 +121,7 @@ impl Samples {
             self.extend("le");
             self.text.clear();
             // Writing to memory cannot fail.
-            let _ = match bound.is_finite() {
-                true => write!(self.text, "{bound:?}"),
-                false => write!(self.text, "+Inf"),
-            };
+            let _ = write_bound(&mut self.text, bound);
             self.extend_by_text();
             self.add(up_to as f64);
         }
@@ -168,6 +165,20 @@ impl Samples {
     }
 }
 
+/// Writes the upper bound of a bucket as Prometheus stores it after a scrape: with a decimal point,
+/// or below 1e-4 with an exponent of at least two digits.
+fn write_bound(text: &mut String, bound: f64) -> fmt::Result {
+    if bound.is_infinite() {
+        return text.write_str("+Inf");
+    }
+    if bound > 0.0 && bound < 1e-4 {
+        let short = format!("{bound:e}");
+        let (digits, exponent) = short.split_once("e-").unwrap_or((short.as_str(), "0"));
+        return write!(text, "{digits}e-{exponent:0>2}");
+    }
+    write!(text, "{bound:?}")
+}
+
 /// Returns the first byte of keys: the number of the type in version 2.0 (`Metadata.MetricType`).
 const fn kind(kind: Kind) -> u8 {
     match kind {
@@ -198,6 +209,23 @@ mod tests {
         let text = |key: &Key| parts(key).1.collect::<Vec<_>>().join(" ");
         let samples = scrape.samples.iter();
         samples.map(|(key, value)| (text(key), *value)).collect()
+    }
+
+    #[test]
+    fn bounds_are_those_that_prometheus_stores_after_a_scrape() {
+        for (bound, expected) in [
+            (1e-12, "1e-12"),
+            (0.00001, "1e-05"),
+            (0.000025, "2.5e-05"),
+            (0.0001, "0.0001"),
+            (0.5, "0.5"),
+            (10.0, "10.0"),
+            (f64::INFINITY, "+Inf"),
+        ] {
+            let mut text = String::new();
+            write_bound(&mut text, bound).unwrap();
+            assert_eq!(text, expected);
+        }
     }
 
     #[test]

@@ -145,8 +145,9 @@ async fn events(
             Position::Unknown => (0, true),
         },
     };
-    let permit = STREAM_SLOTS.take(granted.has_token()).ok_or_else(|| {
-        let detail = format!("{MAX_STREAMS} streams are open, which is the limit");
+    let has_token = granted.has_token();
+    let permit = STREAM_SLOTS.take(has_token).ok_or_else(|| {
+        let detail = STREAM_SLOTS.refusal("streams", has_token);
         Problem::new(Code::TooManyStreams, detail)
     })?;
     let mut stream = Stream {

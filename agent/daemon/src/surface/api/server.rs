@@ -42,7 +42,7 @@ pub enum OpenError {
         /// The address.
         address: SocketAddr,
     },
-    /// The address is in use or does not belong to this host.
+    /// The address is in use, or is a local one that this host does not have.
     #[error("cannot listen on {address}: change `api.listen` in the configuration or pass `--api`")]
     Address {
         /// The address.
@@ -113,7 +113,7 @@ impl Server {
     /// Binds an address. Without a token, it must be a loopback address.
     ///
     /// # Errors
-    /// Fails if the address needs a token, is in use, or does not belong to this host.
+    /// Fails if the address needs a token or cannot be bound.
     pub fn bind(&mut self, address: SocketAddr) -> Result<(), OpenError> {
         if !address.ip().is_loopback() && self.token.is_none() {
             return Err(OpenError::Unprotected { address });

@@ -464,8 +464,8 @@ async fn each_new_subscription_to_a_latched_topic_receives_its_last_message() {
                 _ => tokio::task::yield_now().await,
             }
         };
-        subscriptions.confirm_applied(&requests, latched);
-        subscriptions.confirm_applied(&requests, latched);
+        subscriptions.confirm_applied(&requests, Timestamp(9), latched);
+        subscriptions.confirm_applied(&requests, Timestamp(9), latched);
         let data = loop {
             if let Message::Binary(data) = scene.socket.next().await.unwrap().unwrap() {
                 break data;

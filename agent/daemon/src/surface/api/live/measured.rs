@@ -51,7 +51,8 @@ pub(super) fn of_watches(all: &FindingInputs<'_>) -> Vec<Finding> {
     list
 }
 
-/// Returns a finding with the cause for each topic that lost messages recently.
+/// Returns a finding for each topic that lost messages recently. Receivers and causes are counted
+/// since the topic is measured, so the text says that they are not only of the current loss.
 pub(super) fn losses(all: &FindingInputs<'_>) -> Vec<Finding> {
     let lost = recent_losses(all.past);
     let topics = all.snapshot.topics.iter();
@@ -59,8 +60,8 @@ pub(super) fn losses(all: &FindingInputs<'_>) -> Vec<Finding> {
         let known = all.past.id(topic.domain_id, &topic.dds_name)?;
         lost.get(&known)?;
         let (place, remedy) = main_loss_cause(topic);
-        let receiver = worst_receiver(topic).map_or_else(String::new, |name| format!(" to {name}"));
-        let text = format!("{} loses messages{receiver}{place}", topic.name);
+        let receiver = worst_receiver(topic);
+        let text = loss_in_words(&topic.name, receiver.as_deref(), place);
         let about = format!("{}|{}", topic.domain_id, topic.dds_name);
         let loss = Finding {
             domain_id: Some(topic.domain_id.0),
@@ -71,6 +72,19 @@ pub(super) fn losses(all: &FindingInputs<'_>) -> Vec<Finding> {
         Some(loss.with_remedy(remedy))
     });
     found.collect()
+}
+
+/// Returns the text of a loss, with the worst receiver and the main place, if known.
+fn loss_in_words(topic: &str, receiver: Option<&str>, place: Option<&str>) -> String {
+    let most = "since it is measured, most of them";
+    match (receiver, place) {
+        (None, None) => format!("{topic} loses messages"),
+        (Some(name), None) => format!("{topic} loses messages; {most} to {name}"),
+        (None, Some(place)) => format!("{topic} loses messages; {most} {place}"),
+        (Some(name), Some(place)) => {
+            format!("{topic} loses messages; {most} to {name}, and most of them {place}")
+        }
+    }
 }
 
 /// Returns the nodes, or the process, of the receiver that lost most messages of a topic.
@@ -88,7 +102,7 @@ fn worst_receiver(topic: &TopicFacts) -> Option<String> {
 }
 
 /// Returns where most of a topic's messages were lost, if known, and the remedy.
-fn main_loss_cause(topic: &TopicFacts) -> (&'static str, &'static str) {
+fn main_loss_cause(topic: &TopicFacts) -> (Option<&'static str>, &'static str) {
     let received = topic.received.as_deref();
     let at = received.map_or([0; 4], |received| {
         [
@@ -102,27 +116,27 @@ fn main_loss_cause(topic: &TopicFacts) -> (&'static str, &'static str) {
     let [sender, before, reassembly, _] = at;
     if most == 0 {
         (
-            "",
+            None,
             "compare the loss of each subscriber on the topic's page; `rp doctor` checks buffers",
         )
     } else if most == sender {
         (
-            ", most of them at the sender, before its TCP connection",
+            Some("at the sender, before its TCP connection"),
             "send less over this link, or raise the publisher's history depth and TCP send buffer",
         )
     } else if most == before {
         (
-            ", most of them before they reach this host",
+            Some("before they reach this host"),
             "check the network and the sender's host",
         )
     } else if most == reassembly {
         (
-            ", most of them in IP reassembly",
+            Some("in IP reassembly"),
             "raise net.ipv4.ipfrag_high_thresh, or send smaller messages; `rp doctor` checks it",
         )
     } else {
         (
-            ", most of them in the full buffer of a subscriber's socket",
+            Some("in the full buffer of a subscriber's socket"),
             "raise net.core.rmem_max and the receive buffer, or read faster; `rp doctor` checks it",
         )
     }
@@ -144,4 +158,28 @@ fn began(past: &Past, topic: u32) -> Option<f64> {
         }
     }
     began
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn receiver_and_place_of_a_loss_are_named_as_those_since_the_topic_is_measured() {
+        let place = Some("in IP reassembly");
+        let texts = [
+            loss_in_words("/imu", None, None),
+            loss_in_words("/imu", Some("/base"), None),
+            loss_in_words("/imu", None, place),
+            loss_in_words("/imu", Some("/base"), place),
+        ];
+        let expected = [
+            "/imu loses messages",
+            "/imu loses messages; since it is measured, most of them to /base",
+            "/imu loses messages; since it is measured, most of them in IP reassembly",
+            "/imu loses messages; since it is measured, most of them to /base, and most of them in \
+             IP reassembly",
+        ];
+        assert_eq!(texts, expected);
+    }
 }

@@ -114,11 +114,10 @@ async fn live(
     State(context): State<Context>,
     Extension(granted): Extension<Rights>,
 ) -> Result<Response, Problem> {
-    let permit = context.live.places.take(granted.has_token());
-    let permit = permit.ok_or_else(|| {
-        let detail = format!("{MAX_TABS} pages are open, which is the limit");
-        Problem::new(Code::TooManyStreams, detail)
-    })?;
+    let (places, has_token) = (&context.live.places, granted.has_token());
+    let permit = places
+        .take(has_token)
+        .ok_or_else(|| Problem::new(Code::TooManyStreams, places.refusal("pages", has_token)))?;
     let stream = Stream {
         access: granted.access().to_string(),
         last_sent_round: None,
