@@ -249,6 +249,9 @@ unsafe fn reset_thread(followed: *mut Followed) {
     // SAFETY: a map value, by the caller.
     unsafe {
         reset_activity(followed);
+        if (*followed).state == state::RUNNABLE {
+            add_runnable(-1);
+        }
         (*followed).state = state::RUNNING;
         (*followed).state_since_ns = 0;
         (*followed).on_cpu_since_ns = 0;

@@ -18,6 +18,16 @@ const TOPIC_NAME_OFFSET: u64 = 16;
 /// Maximum number of attempts to read a name, whose page may not be resident.
 const MAX_NAME_ATTEMPTS: u32 = 16;
 
+/// What became of an announcement.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Outcome {
+    Sent,
+    /// The ring is full.
+    RingFull,
+    /// The first name cannot be read.
+    Unreadable,
+}
+
 /// Announces a publisher at its first publication.
 #[inline(always)]
 pub fn announce_publisher(current: &CallContext, figures: *mut Figures, publisher: u64) {
@@ -142,7 +152,7 @@ fn announce_new_endpoint(
     rmw: u64,
 ) {
     let identifier = read_user::<u64>(rmw);
-    let is_sent = send_announcement(
+    let outcome = send_announcement(
         current,
         announcement_kind,
         address,
@@ -156,7 +166,9 @@ fn announce_new_endpoint(
     } else {
         kind::SUBSCRIPTION
     };
-    if is_sent && let Some(figures) = current.figures(address, handle_kind) {
+    if outcome == Outcome::Sent
+        && let Some(figures) = current.figures(address, handle_kind)
+    {
         // SAFETY: a map value pointer checked against null.
         unsafe { (*figures).announced = MAX_NAME_ATTEMPTS };
     }
@@ -175,9 +187,15 @@ fn announce_existing_endpoint(
         read_user::<u64>(rmw),
         read_user::<u64>(rmw + TOPIC_NAME_OFFSET),
     );
-    if send_announcement(current, announcement_kind, address, 0, 0, topic, identifier) {
-        // SAFETY: a map value, by the caller.
-        unsafe { (*figures).announced = MAX_NAME_ATTEMPTS };
+    let outcome = send_announcement(current, announcement_kind, address, 0, 0, topic, identifier);
+    // SAFETY: a map value, by the caller.
+    unsafe {
+        if outcome == Outcome::Sent {
+            (*figures).announced = MAX_NAME_ATTEMPTS;
+        } else if outcome == Outcome::RingFull {
+            // The name was not read, so the attempt does not count.
+            (*figures).announced -= 1;
+        }
     }
 }
 
@@ -233,7 +251,7 @@ fn is_internal(rmw: u64) -> bool {
         && read_user::<u8>(read_user(rmw + TOPIC_NAME_OFFSET)) != 0
 }
 
-/// Sends an announcement. Returns `false` if the ring is full, or if the first name cannot be read.
+/// Sends an announcement.
 #[inline(always)]
 fn send_announcement(
     current: &CallContext,
@@ -243,10 +261,10 @@ fn send_announcement(
     value: u64,
     text: u64,
     second_text: u64,
-) -> bool {
+) -> Outcome {
     let Some(mut entry) = ANNOUNCEMENTS.reserve::<Announcement>(0) else {
         count(Counter::AnnouncementsLost);
-        return false;
+        return Outcome::RingFull;
     };
     let announcement = entry.as_mut_ptr();
     // SAFETY: memory of the size of an announcement that this run has reserved; every field that
@@ -269,10 +287,10 @@ fn send_announcement(
     if text != 0 && length <= 0 {
         count(Counter::Unreadable);
         entry.discard(0);
-        return false;
+        return Outcome::Unreadable;
     }
     entry.submit(0);
-    true
+    Outcome::Sent
 }
 
 /// Copies a string of the running process; returns its length with the terminating zero, or a

@@ -388,6 +388,18 @@ impl Drop for Broker {
     }
 }
 
+/// Returns whether a broker may listen at a socket. Only a refusal proves that none does: the file of
+/// a broker that was killed stays.
+#[must_use]
+pub fn is_listening(path: &Path) -> bool {
+    let absent = [
+        io::ErrorKind::NotFound,
+        io::ErrorKind::NotADirectory,
+        io::ErrorKind::ConnectionRefused,
+    ];
+    open(path).map_or_else(|error| !absent.contains(&error.kind()), |_| true)
+}
+
 /// Returns the command of a broker whose log has the level of this process.
 fn command() -> Command {
     let mut command = Command::new("/proc/self/exe");
@@ -469,6 +481,8 @@ fn bounded(socket: &OwnedFd) -> io::Result<()> {
 mod tests {
     use std::thread;
 
+    use rustix::net::{bind, listen};
+
     use super::*;
 
     /// Returns a client of a child that answers nothing, and the child's end of the connection.
@@ -489,6 +503,22 @@ mod tests {
     fn reply(socket: &OwnedFd, number: u64, content: Answer) {
         let answer = Numbered { number, content };
         send(socket.as_fd(), &answer, &[], SendFlags::empty()).unwrap();
+    }
+
+    #[test]
+    fn nobody_listens_at_the_file_of_a_socket_that_was_closed() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("attach.sock");
+        assert!(!is_listening(&path));
+        let (family, kind) = (AddressFamily::UNIX, SocketType::SEQPACKET);
+        let listener = socket_with(family, kind, SocketFlags::CLOEXEC, None).unwrap();
+        bind(&listener, &SocketAddrUnix::new(&path).unwrap()).unwrap();
+        listen(&listener, 1).unwrap();
+        assert!(is_listening(&path));
+        drop(listener);
+        assert!(path.exists());
+        assert!(!is_listening(&path));
+        assert!(!is_listening(&path.join("below")));
     }
 
     #[test]

@@ -11,6 +11,7 @@ pub(crate) mod answer;
 
 use std::io;
 use std::os::fd::{AsFd as _, BorrowedFd, OwnedFd};
+use std::os::unix::ffi::OsStrExt as _;
 use std::time::{Duration, Instant};
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
@@ -52,12 +53,14 @@ pub struct Peer {
     pub user: u32,
 }
 
-/// Answers connections of root and of `users` to a listening socket. Returns after `idle` without a
-/// child process. The calling process should adopt its descendants (PR_SET_CHILD_SUBREAPER).
+/// Answers connections of root and of `users` to a listening socket. With `idle`, something else
+/// starts the broker on demand. Then this function returns after `idle` without a child process, and
+/// at a connection after the broker's program was replaced: the new program accepts it. The calling
+/// process should adopt its descendants (PR_SET_CHILD_SUBREAPER).
 ///
 /// # Errors
 /// Fails if the kernel refuses to wait.
-pub fn serve(listener: OwnedFd, users: &[u32], idle: Duration) -> io::Result<()> {
+pub fn serve(listener: OwnedFd, users: &[u32], idle: Option<Duration>) -> io::Result<()> {
     let mut listener = Some(listener);
     let mut connections = Vec::new();
     let mut used = Instant::now();
@@ -66,19 +69,30 @@ pub fn serve(listener: OwnedFd, users: &[u32], idle: Duration) -> io::Result<()>
         if reap(&mut connections) {
             used = Instant::now();
         }
-        let rest = idle.saturating_sub(used.elapsed());
+        let rest = idle.map_or(MAX_WAIT, |idle| idle.saturating_sub(used.elapsed()));
         if rest.is_zero() {
             break;
         }
         let has_room = connections.len() < MAX_CONNECTIONS;
         let source = has_room.then(|| listening.as_fd());
-        if ready(source, rest.min(MAX_WAIT))?
-            && let Some(socket) = accept(listening)
-        {
+        if !ready(source, rest.min(MAX_WAIT))? {
+            continue;
+        }
+        if idle.is_some() && is_replaced() {
+            tracing::info!("ends: its program was replaced");
+            break;
+        }
+        if let Some(socket) = accept(listening) {
             connections.extend(begin(socket, users, &mut listener));
         }
     }
     Ok(())
+}
+
+/// Returns whether the file of this program was removed, as by an upgrade (proc_pid_exe(5)).
+fn is_replaced() -> bool {
+    let path = std::fs::read_link("/proc/self/exe");
+    path.is_ok_and(|path| path.as_os_str().as_bytes().ends_with(b" (deleted)"))
 }
 
 /// Reaps children that have ended, and returns whether other children are left.

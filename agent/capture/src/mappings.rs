@@ -6,15 +6,17 @@
 //! as in the broker's PID namespace.
 
 use std::collections::BTreeSet;
+use std::fs;
 use std::io;
 use std::os::fd::{AsFd, AsRawFd as _, BorrowedFd, OwnedFd};
 use std::ptr::{self, NonNull};
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use ros2probe_attach::client::{Broker, BrokerError};
 
 use crate::error_chain::Reason;
+use crate::system::monotonic;
 
 /// Pause after mappings of other files. It bounds the cost on a machine that starts many programs.
 pub const UNRELATED_DELAY: Duration = Duration::from_millis(2);
@@ -32,10 +34,48 @@ const BEFORE_NAME: usize = 40;
 /// Maximum size of a record, in bytes: its length field has 16 bits.
 const MAX_RECORD: usize = u16::MAX as usize;
 
+/// File that lists the CPUs in use.
+const ONLINE_PATH: &str = "/sys/devices/system/cpu/online";
+/// Time since the start of the machine, with its suspensions.
+const UPTIME_PATH: &str = "/proc/uptime";
+/// Pause between two comparisons of the CPUs.
+const CPU_CHECK_INTERVAL: Duration = Duration::from_secs(1);
+/// Time between two readings of clocks above which they are not compared.
+const MAX_READING: Duration = Duration::from_millis(50);
+/// Minimum of a noticed suspension, above the errors of the readings.
+const MIN_SUSPENSION: Duration = Duration::from_millis(100);
+
 /// The rings of all CPUs.
 pub struct MappingEvents {
     rings: Vec<Ring>,
     record: Vec<u8>,
+    opened: Cpus,
+    checked: Instant,
+}
+
+/// What ends the events of a CPU for good: it goes offline, also during a suspension.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Cpus {
+    /// Text of [`ONLINE_PATH`].
+    online: String,
+    /// Time for which the machine was suspended; `None` if it is not known.
+    suspended: Option<Duration>,
+}
+
+impl Cpus {
+    fn read() -> Self {
+        Self {
+            online: fs::read_to_string(ONLINE_PATH).unwrap_or_default(),
+            suspended: suspended(),
+        }
+    }
+
+    /// Returns whether events that were opened at `self` still report all mappings at `now`.
+    fn are_same(&self, now: &Self) -> bool {
+        let times = self.suspended.zip(now.suspended);
+        let was_suspended = times.is_some_and(|(then, now)| now >= then + MIN_SUSPENSION);
+        self.online == now.online && !was_suspended
+    }
 }
 
 /// Why mappings cannot be detected.
@@ -64,11 +104,30 @@ impl MappingEvents {
     /// # Errors
     /// Fails if the broker refuses, or if the kernel has no such events.
     pub fn open(broker: &mut Broker) -> Result<Self, MappingError> {
+        // A CPU that changes from now on is noticed.
+        let opened = Cpus::read();
         let rings = broker.mappings()?.into_iter().map(Ring::new);
         Ok(Self {
             rings: rings.collect::<io::Result<_>>()?,
             record: Vec::new(),
+            opened,
+            checked: Instant::now(),
         })
+    }
+
+    /// Drops events that miss mappings since a CPU came or went, or since the machine was
+    /// suspended. Returns whether there were any: new events have to be opened. Looks once a
+    /// second.
+    pub fn drop_stale(events: &mut Option<Self>) -> bool {
+        events.take_if(Self::is_stale).is_some()
+    }
+
+    fn is_stale(&mut self) -> bool {
+        if self.checked.elapsed() < CPU_CHECK_INTERVAL {
+            return false;
+        }
+        self.checked = Instant::now();
+        !self.opened.are_same(&Cpus::read())
     }
 
     /// Opens the rings for the configuration key `key`. Without them, the thread of that key finds
@@ -201,6 +260,17 @@ impl Drop for Ring {
     }
 }
 
+/// Returns for how long the machine was suspended since its start; `None` if this thread lost its
+/// CPU between the readings of the two clocks.
+fn suspended() -> Option<Duration> {
+    let before = monotonic();
+    let uptime = fs::read_to_string(UPTIME_PATH).ok()?;
+    let spent = Duration::from_nanos(monotonic().saturating_sub(before));
+    let seconds = uptime.split_ascii_whitespace().next()?.parse().ok()?;
+    let uptime = Duration::try_from_secs_f64(seconds).ok()?;
+    (spent < MAX_READING).then(|| uptime.saturating_sub(Duration::from_nanos(before)))
+}
+
 /// Returns the process of a record, if the mapped file is of interest.
 fn process(record: &[u8], is_library: impl Fn(&str) -> bool) -> Option<u32> {
     let process = record.get(8..12)?.try_into().ok().map(u32::from_ne_bytes)?;
@@ -213,8 +283,6 @@ fn process(record: &[u8], is_library: impl Fn(&str) -> bool) -> Option<u32> {
 
 #[cfg(test)]
 mod tests {
-    use std::time::{Duration, Instant};
-
     use super::*;
     use crate::system::wait;
 
@@ -230,6 +298,41 @@ mod tests {
         }
         record[8..12].copy_from_slice(&[0; 4]);
         assert_eq!(process(&record, is_library), None);
+    }
+
+    #[test]
+    fn events_are_stale_once_a_cpu_came_or_went_or_the_machine_was_suspended() {
+        let now = Cpus::read();
+        assert!(!now.online.is_empty());
+        let at = |online: &str, suspended: Option<Duration>| Cpus {
+            online: online.to_owned(),
+            suspended,
+        };
+        let known = Some(Duration::from_secs(7));
+        let opened = at("0-3\n", known);
+        assert!(opened.are_same(&at("0-3\n", known)));
+        assert!(opened.are_same(&at("0-3\n", None)));
+        assert!(opened.are_same(&at("0-3\n", Some(Duration::from_millis(7_020)))));
+        assert!(!opened.are_same(&at("0-2\n", known)));
+        assert!(!opened.are_same(&at("0-3\n", Some(Duration::from_secs(8)))));
+
+        let events = |opened: &Cpus| {
+            Some(MappingEvents {
+                rings: Vec::new(),
+                record: Vec::new(),
+                opened: opened.clone(),
+                checked: Instant::now() - CPU_CHECK_INTERVAL,
+            })
+        };
+        let other = Cpus {
+            online: "none\n".to_owned(),
+            ..now.clone()
+        };
+        let mut absent = events(&other);
+        assert!(MappingEvents::drop_stale(&mut absent) && absent.is_none());
+        assert!(!MappingEvents::drop_stale(&mut absent));
+        let mut current = events(&now);
+        assert!(!MappingEvents::drop_stale(&mut current) && current.is_some());
     }
 
     #[test]

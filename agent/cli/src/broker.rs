@@ -22,8 +22,6 @@ use rustix::process::{getpid, set_child_subreaper};
 
 /// Time without a connection after which a broker exits if systemd started it on demand.
 const IDLE_TIMEOUT: Duration = Duration::from_secs(10);
-/// A broker that was started by hand does not exit when it is idle.
-const NO_IDLE_TIMEOUT: Duration = Duration::from_secs(u64::MAX / 4);
 /// Maximum number of connections that wait to be accepted.
 const MAX_WAITING_CONNECTIONS: i32 = 8;
 const NO_SOCKET: &str =
@@ -41,14 +39,14 @@ pub(crate) fn run(path: Option<&Path>, user: &str) -> Result<()> {
     let _log = Log::start(Level::Info, None);
     hide_memory().context("cannot protect the memory of this process")?;
     let (listener, idle) = match path {
-        Some(path) => (bound(path)?, NO_IDLE_TIMEOUT),
+        Some(path) => (bound(path)?, None),
         None => {
             let input = io::stdin().as_fd().try_clone_to_owned()?;
             if !socket_acceptconn(&input).context(NO_SOCKET)? {
                 confine()?;
                 return serve_one(input).context("cannot answer the agent");
             }
-            (input, IDLE_TIMEOUT)
+            (input, Some(IDLE_TIMEOUT))
         }
     };
     let id = user_id(user);

@@ -215,6 +215,12 @@ impl LateObservation {
         if self.mode == mode::OFF {
             return;
         }
+        if self.mode == mode::EVENTS
+            && let Err(error) = tables.correct_runnable()
+        {
+            let reason = in_words(&error);
+            tracing::debug!(reason, "the number of threads that could run may be wrong");
+        }
         let callbacks = tables.figures();
         let callbacks: Vec<_> = callbacks
             .filter(|(handle, _)| handle.kind == kind::CALLBACK)

@@ -32,6 +32,7 @@ use self::programs::Tables;
 use self::table::Round;
 use crate::bell::Bell;
 use crate::breakpoints::AttachMethod;
+use crate::container::has_own_processes;
 use crate::filter::{Deliveries, FilterError};
 use crate::settings::{InsideChoice, LateChoice};
 use crate::shm::directories::Scope;
@@ -106,13 +107,18 @@ impl Inside {
     /// control group.
     ///
     /// # Errors
-    /// Fails if a capability is missing, or if the kernel has no uprobes.
+    /// Fails if a capability is missing, if the kernel has no uprobes, or if this process has a PID
+    /// namespace of its own.
     pub fn open(
         (choice, late): (InsideChoice, LateChoice),
         cgroup: Option<&Path>,
         broker: &Path,
         deliveries: Option<(Deliveries, File)>,
     ) -> Result<Self, UprobeError> {
+        // Every observed process would seem to have ended, or would have another one's name.
+        if has_own_processes() {
+            return Err(UprobeError::OwnProcesses);
+        }
         let mut broker = uprobe::broker(broker)?;
         let within = cgroup.map(uprobe::inode).transpose()?;
         let has_callbacks = matches!(choice, InsideChoice::Full | InsideChoice::Auto);

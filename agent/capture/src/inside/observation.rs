@@ -82,6 +82,14 @@ impl Probes {
         }
     }
 
+    /// Detaches from installed libraries that were written, and returns whether any waits for new
+    /// probes.
+    fn detach_written(&mut self, now: Instant) -> bool {
+        let on_demand = self.on_demand.as_mut();
+        let waits = on_demand.is_some_and(|on_demand| on_demand.detach_written(now));
+        self.lasting.detach_written(now) || waits
+    }
+
     /// Returns whether the lasting probes are attached, which are also at calls if none is on demand.
     const fn needs_lasting(&self, to_calls: bool) -> bool {
         to_calls || self.on_demand.is_some()
@@ -207,7 +215,11 @@ impl Observation {
         // A late round is skipped, so the observation ends only when its last round can be
         // reported.
         let ends = !shared.is_wanted() && !shared.is_late();
-        let failed = self.find(now, !ends && self.suspended_at.is_none());
+        self.probes.detach_written(now);
+        // Processes may have started while events were lost.
+        let has_lost_events = MappingEvents::drop_stale(&mut self.mappings);
+        let to_calls = !ends && self.suspended_at.is_none();
+        let failed = self.find(now, to_calls, has_lost_events);
         if ends {
             self.probes.detach();
         }
@@ -228,11 +240,11 @@ impl Observation {
         self.wait(shared, now + REPORT_INTERVAL);
     }
 
-    /// Finds processes and attaches to their libraries. Returns the error if the broker did not
-    /// answer.
-    fn find(&mut self, now: Instant, to_calls: bool) -> Option<String> {
+    /// Finds processes and attaches to their libraries. With `all`, inspects processes that did not
+    /// use the library so far. Returns the error if the broker did not answer.
+    fn find(&mut self, now: Instant, to_calls: bool, all: bool) -> Option<String> {
         let broker = &mut self.broker;
-        let found = self.processes.find(false, broker);
+        let found = self.processes.find(all, broker);
         let failed = found.err().map(|error| in_words(&error));
         if failed.is_none() {
             if self.mappings.is_none() {
@@ -298,9 +310,11 @@ impl Observation {
             false if self.table.len() >= MANY_PROCESSES => SHORT_REVIEW_INTERVAL,
             false => REVIEW_INTERVAL,
         };
-        if now - self.last_review >= interval {
+        let is_due = now - self.last_review >= interval;
+        let has_lost_events = MappingEvents::drop_stale(&mut self.mappings);
+        if self.probes.detach_written(now) || has_lost_events || is_due {
             self.last_review = now;
-            let failed = self.find(now, false);
+            let failed = self.find(now, false, has_lost_events);
             let clocks = Clocks::read();
             (self.table).forget_ended(&mut self.tables, &clocks, &mut self.broker);
             self.report(shared, failed);

@@ -48,6 +48,8 @@ type BoundWords = [u64; size_of::<Bound>() / 8];
 type FollowedWords = [u64; 24 + FOLLOWED_STATES + 15];
 const FOLLOWED_STATES: usize =
     (2 * (size_of::<Blocked>() + size_of::<Activity>()) + size_of::<Handoff>()) / 8;
+/// The first word of a followed thread that can run and does not.
+const RUNNABLE: u64 = 1;
 /// Tracepoints of the scheduler. The programs have the same names.
 const SCHEDULER_EVENTS: [&CStr; 2] = [c"sched_switch", c"sched_waking"];
 const _: () = assert!(size_of::<Figures>().is_multiple_of(8));
@@ -79,6 +81,8 @@ pub struct Tables {
     followed: HashMap<MapData, u32, FollowedWords>,
     /// Number of these threads that can run and do not.
     runnable: Array<MapData, i64>,
+    /// Whether that number was wrong at the last comparison.
+    was_runnable_wrong: bool,
 }
 
 /// The probes in one library; dropping the value removes the breakpoints.
@@ -130,6 +134,7 @@ pub fn load(
         bounds: take(ebpf, "BOUNDS")?,
         followed: take(ebpf, "FOLLOWED_THREADS")?,
         runnable: take(ebpf, "RUNNABLE_THREADS")?,
+        was_runnable_wrong: false,
     };
     let programs = Programs {
         breakpoints,
@@ -397,6 +402,26 @@ impl Tables {
         set.map_err(failed("LATE_MODE", "set"))
     }
 
+    /// Corrects the number of followed threads that can run and do not. A thread that the full table
+    /// drops stays in that number, and then the programs store all switches of all threads. The
+    /// number is wrong if two calls in a row find no such thread.
+    ///
+    /// # Errors
+    /// Fails if the kernel refuses the lookup or the update.
+    pub fn correct_runnable(&mut self) -> Result<(), FilterError> {
+        let number = self.runnable.get(&0, 0);
+        let number = number.map_err(failed("RUNNABLE_THREADS", "read"))?;
+        let is_runnable = |(_, [state, ..]): (u32, FollowedWords)| state == RUNNABLE;
+        let is_any = || self.followed.iter().filter_map(Result::ok).any(is_runnable);
+        let is_wrong = number != 0 && !is_any();
+        if is_wrong && self.was_runnable_wrong {
+            let set = self.runnable.set(0, 0, 0);
+            set.map_err(failed("RUNNABLE_THREADS", "set"))?;
+        }
+        self.was_runnable_wrong = is_wrong && !self.was_runnable_wrong;
+        Ok(())
+    }
+
     /// Sets from when on calls of a callback are late.
     ///
     /// # Errors
@@ -431,5 +456,80 @@ impl Tables {
             }
         }
         Ok(sums)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::{BufRead as _, BufReader, Write as _};
+    use std::process::{Command, Stdio};
+
+    use ros2probe_testing::harness::traced_program::TracedProgram;
+    use ros2probe_wire::inside::late::mode;
+
+    use super::*;
+
+    /// Word of a followed thread with its process.
+    const PROCESS: usize = 5;
+
+    fn loaded() -> (Programs, Tables) {
+        load(true, None, AttachMethod::of_this_kernel())
+            .expect("loading the kernel programs needs root: run the tests with sudo")
+    }
+
+    fn runnable(tables: &Tables) -> i64 {
+        tables.runnable.get(&0, 0).unwrap()
+    }
+
+    #[test]
+    fn a_number_of_runnable_threads_without_such_a_thread_is_corrected_in_the_second_round() {
+        let (_programs, mut tables) = loaded();
+        for number in [2, -1] {
+            tables.runnable.set(0, number, 0).unwrap();
+            tables.correct_runnable().unwrap();
+            assert_eq!(runnable(&tables), number);
+            tables.correct_runnable().unwrap();
+            assert_eq!(runnable(&tables), 0);
+        }
+        let mut thread: FollowedWords = [0; size_of::<FollowedWords>() / 8];
+        thread[0] = RUNNABLE;
+        tables.followed.insert(1, thread, 0).unwrap();
+        tables.runnable.set(0, 1, 0).unwrap();
+        for _ in 0..3 {
+            tables.correct_runnable().unwrap();
+            assert_eq!(runnable(&tables), 1);
+        }
+    }
+
+    #[test]
+    fn a_thread_whose_id_another_one_had_leaves_no_runnable_thread() {
+        let (programs, mut tables) = loaded();
+        let program = TracedProgram::build(248, &[]).unwrap();
+        let library = File::open(program.library()).unwrap();
+        let _attached = programs.attach_here(&library).unwrap();
+        tables.set_late_mode(mode::SUMS).unwrap();
+        let mut process = Command::new(program.program())
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let mut commands = process.stdin.take().unwrap();
+        let mut answers = BufReader::new(process.stdout.take().unwrap()).lines();
+        let mut run = |command: &str| {
+            writeln!(commands, "{command}").unwrap();
+            answers.next().unwrap().unwrap();
+        };
+        run("compute 1 10");
+        // The thread before was in another process, and its end was not observed.
+        let mut thread = tables.followed.get(&process.id(), 0).unwrap();
+        (thread[0], thread[PROCESS]) = (RUNNABLE, 1);
+        tables.followed.insert(process.id(), thread, 0).unwrap();
+        tables.runnable.set(0, 1, 0).unwrap();
+        run("compute 1 10");
+        let thread = tables.followed.get(&process.id(), 0).unwrap();
+        assert_eq!(thread[PROCESS], u64::from(process.id()));
+        assert_eq!(runnable(&tables), 0);
+        process.kill().unwrap();
+        process.wait().unwrap();
     }
 }

@@ -24,7 +24,7 @@ use ros2probe_wire::{DomainId, Timestamp};
 use zerocopy::FromBytes as _;
 
 use super::cpu_limits;
-use super::late::{cgroup_ids, convert};
+use super::late::{MIN_BOUND, cgroup_ids, convert};
 use super::names::{Endpoint, Names, text};
 use super::process::Stat;
 use super::programs::Tables;
@@ -42,6 +42,10 @@ const MIN_EVALUATION_TIME: Duration = Duration::from_millis(500);
 /// Number of items of the announcement ring that are read together: twice as many as fit into it.
 /// A process that announces without end must not keep the thread from applying its budget.
 const DRAIN_BATCH: usize = 10_000;
+/// Step of the wall clock backwards above which calls seem late: the minimum of a learnt bound.
+const MAX_STEP_BACK: Duration = MIN_BOUND;
+/// Number of rounds whose calls may have waits that include such a step.
+const ROUNDS_AFTER_STEP: u32 = 2;
 /// Number of rounds after which a process outside of the control group is inspected again.
 const RECHECK_ROUNDS: u32 = 5;
 
@@ -56,6 +60,10 @@ pub struct ProcessTable {
     /// Units by the ids of control groups; `None`: it is the root, or its path is not found.
     units: Bounded<NamedCgroups, HashMap<u64, Option<Arc<str>>>>,
     rounds: u32,
+    /// The wall clock minus the monotonic clock in the last round, in nanoseconds.
+    ahead: Option<i64>,
+    /// Number of rounds, from this one on, in which calls may only seem late.
+    rounds_after_step: u32,
     /// Time since calls per second were last evaluated.
     since_evaluation: Duration,
 }
@@ -157,6 +165,8 @@ impl ProcessTable {
             cgroups: CgroupPaths::new(cgroup::mount_point().unwrap_or_default()),
             units: Bounded::default(),
             rounds: 0,
+            ahead: None,
+            rounds_after_step: 0,
             since_evaluation: Duration::ZERO,
         }
     }
@@ -274,6 +284,7 @@ impl ProcessTable {
     pub fn forget_reports(&mut self) {
         self.hops.clear();
         self.late.clear();
+        self.ahead = None;
         for observed in self.known.values_mut() {
             observed.forget_reports();
         }
@@ -372,7 +383,7 @@ impl ProcessTable {
                 self.handle(report, *handle, figures, clocks);
             }
         }
-        let calls = self.late.take();
+        let calls = self.take_late_calls(clocks);
         let cpu_limits = match calls.is_empty() {
             true => Arc::new([]),
             false => cpu_limits::read(Path::new("/sys")),
@@ -614,6 +625,27 @@ impl ProcessTable {
         }
     }
 
+    /// Takes the late calls of this round. The programs compute waits with the wall clock of the last
+    /// round. If it was set back since then, each message seems to have waited for the step. Then only
+    /// calls count that lasted too long themselves.
+    fn take_late_calls(&mut self, clocks: &Clocks) -> Vec<late::LateCall> {
+        let ahead = clocks.now.0.wrapping_sub(clocks.monotonic).cast_signed();
+        let before = self.ahead.replace(ahead).unwrap_or(ahead);
+        let step_back = u64::try_from(before.saturating_sub(ahead)).unwrap_or(0);
+        self.rounds_after_step = match Duration::from_nanos(step_back) > MAX_STEP_BACK {
+            true => ROUNDS_AFTER_STEP,
+            false => self.rounds_after_step.saturating_sub(1),
+        };
+        let mut calls = self.late.take();
+        if self.rounds_after_step > 0 {
+            calls.retain(|call| {
+                let [longest, _] = call.bounds;
+                call.ended.saturating_sub(call.started) > longest
+            });
+        }
+        calls
+    }
+
     /// Names the callbacks of a late call; `None` if its process has ended.
     fn late_call(
         &self,
@@ -821,6 +853,32 @@ mod tests {
         }
         assert_driven::<LateCalls>();
         assert_eq!(table.late.len(), LateCalls::CAP);
+    }
+
+    #[test]
+    fn a_wall_clock_that_is_set_back_makes_no_call_late() {
+        const SECOND: u64 = 1_000_000_000;
+        let mut table = table();
+        let mut at = |second: u64, wall_clock: u64| {
+            let clocks = Clocks {
+                now: Timestamp(wall_clock * SECOND),
+                monotonic: second * SECOND,
+                step: 0,
+            };
+            // One call began late, and the other one lasted too long.
+            for lasted in [1, 20] {
+                let mut call = Box::new(late::LateCall::new_zeroed());
+                call.bounds = [10, 10];
+                (call.started, call.ended, call.delay) = (100, 100 + lasted, SECOND);
+                table.apply_item(Some(Item::Late(call)), &clocks, &mut Broker::here());
+            }
+            table.take_late_calls(&clocks).len()
+        };
+        assert_eq!([at(1, 1001), at(2, 1002)], [2, 2]);
+        assert_eq!([at(3, 993), at(4, 994), at(5, 995)], [1, 1, 2]);
+        assert_eq!(at(6, 2000), 2, "set forward");
+        table.forget_reports();
+        assert_eq!(table.ahead, None);
     }
 
     #[test]

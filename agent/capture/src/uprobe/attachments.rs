@@ -5,7 +5,9 @@
 //! from its first message.
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::fs;
+use std::os::unix::fs::MetadataExt as _;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use ros2probe_attach::client::{Broker, BrokerError};
@@ -29,6 +31,10 @@ const LONGEST_RETRY_DELAY: Duration = Duration::from_secs(320);
 /// Time of failed attempts after which the other libraries wait for the next call. The broker may
 /// need seconds for each refusal.
 const FAILURE_TIME: Duration = Duration::from_secs(2);
+/// Time without a change after which a file that was written gets a probe again.
+const SETTLING_TIME: Duration = Duration::from_secs(1);
+/// Why a library has no probe in that time.
+const WRITTEN: &str = "the file of the library was written";
 /// All known libraries, with a probe `P` in each.
 pub struct Attachments<P> {
     attach: Attach<P>,
@@ -49,8 +55,31 @@ struct Known<P> {
     /// Time after which another attempt is made, and the pause before it.
     retried: Instant,
     pause: Duration,
-    /// Whether the probe was attached before any process used the library, and is kept.
-    is_installed: bool,
+    /// Version of a file whose probe was attached before any process used the library, and is
+    /// kept; `None` if a process uses or used it.
+    installed: Option<Version>,
+}
+
+/// Attributes of a file that change when it is written, or replaced by another one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Version {
+    file: (u64, u64),
+    bytes: u64,
+    modified: (i64, i64),
+    changed: (i64, i64),
+}
+
+impl Version {
+    /// Returns the version of the file at a path; `None` without such a file.
+    fn of(path: &Path) -> Option<Self> {
+        let metadata = fs::metadata(path).ok()?;
+        Some(Self {
+            file: (metadata.dev(), metadata.ino()),
+            bytes: metadata.size(),
+            modified: (metadata.mtime(), metadata.mtime_nsec()),
+            changed: (metadata.ctime(), metadata.ctime_nsec()),
+        })
+    }
 }
 
 /// Why a library has no probe.
@@ -99,6 +128,45 @@ impl<P> Attachments<P> {
         self.is_installed = false;
     }
 
+    /// Returns whether installed libraries have been attached in advance.
+    #[must_use]
+    pub const fn is_installed(&self) -> bool {
+        self.is_installed
+    }
+
+    /// Detaches from installed libraries whose files were written in place: their functions may
+    /// have moved, and a breakpoint elsewhere can crash a process. [`Self::install`] and
+    /// [`Self::follow`] attach again a second after the last change. Returns whether any waits.
+    pub fn detach_written(&mut self, now: Instant) -> bool {
+        let mut waits = false;
+        for library in self.libraries.values_mut() {
+            let Some(known) = library.installed else {
+                continue;
+            };
+            match Version::of(&library.path) {
+                Some(version) if version == known => {}
+                Some(version) if version.file == known.file => {
+                    let path = library.path.display();
+                    tracing::warn!(library = %path, "uprobe detached: the library was written");
+                    library.probe = Err(Reason(WRITTEN.to_owned()));
+                    library.retried = now + SETTLING_TIME;
+                    library.installed = Some(version);
+                }
+                // Processes may still use the old file, which does not change.
+                _ => {
+                    library.installed = None;
+                    library.used = now;
+                    waits = true;
+                }
+            }
+            waits |= library.installed.is_some() && library.probe.is_err();
+        }
+        if waits {
+            self.is_installed = false;
+        }
+        waits
+    }
+
     /// Attaches to installed libraries that no process uses yet, once after the creation and after
     /// each [`Self::clear`]. Without an answer of the broker, the next call tries again.
     pub fn install(&mut self, library: Library, now: Instant, broker: &mut Broker) {
@@ -107,11 +175,18 @@ impl<P> Attachments<P> {
         }
         self.is_installed = true;
         for path in installed(library) {
-            let Ok(id) = id_as_mapped(&path) else {
+            // The version is read first, so that a change in the meantime is noticed.
+            let (Some(version), Ok(id)) = (Version::of(&path), id_as_mapped(&path)) else {
                 continue;
             };
-            if self.libraries.contains_key(&id) || self.libraries.is_full() {
-                continue;
+            match self.libraries.get(&id) {
+                Some(known) if known.installed.is_none() || known.probe.is_ok() => continue,
+                Some(known) if now < known.retried => {
+                    self.is_installed = false;
+                    continue;
+                }
+                None if self.libraries.is_full() => continue,
+                Some(_) | None => {}
             }
             match (self.attach)(broker, Place::Installed(path.clone())) {
                 Ok(probe) => {
@@ -123,12 +198,14 @@ impl<P> Attachments<P> {
                         used: now,
                         retried: now,
                         pause: RETRY_DELAY,
-                        is_installed: true,
+                        installed: Some(version),
                     };
                     self.libraries.insert(id, library);
                 }
                 // The refusal is reported when a process uses the library.
-                Err(Refusal::Broker(BrokerError::Refused(_)) | Refusal::Program(_)) => {}
+                Err(Refusal::Broker(BrokerError::Refused(_)) | Refusal::Program(_)) => {
+                    self.libraries.remove(&id);
+                }
                 Err(Refusal::Broker(_)) => {
                     self.is_installed = false;
                     return;
@@ -165,7 +242,7 @@ impl<P> Attachments<P> {
         }
         let now = now + began.elapsed();
         self.libraries.retain(|_, library| {
-            let is_used = library.is_installed || now - library.used < DETACH_DELAY;
+            let is_used = library.installed.is_some() || now - library.used < DETACH_DELAY;
             if !is_used && library.probe.is_ok() {
                 let library = library.path.display();
                 tracing::info!(%library, "uprobe detached: the library is no longer in use");
@@ -192,6 +269,7 @@ impl<P> Attachments<P> {
             return Duration::ZERO;
         }
         let (earlier, processes) = known.map(|known| (known.pause, known.processes)).unzip();
+        let installed = known.and_then(|known| Some((known.path.clone(), known.installed?)));
         let began = Instant::now();
         let place = Place::Mapped {
             process,
@@ -219,14 +297,19 @@ impl<P> Attachments<P> {
             Ok(_) => Duration::ZERO,
             Err(_) => spent,
         };
+        // In the process's file system, the path may name another file.
+        let (path, installed) = match installed {
+            Some((path, version)) => (path, Some(version)),
+            None => (path.clone(), None),
+        };
         let library = Known {
-            path: path.clone(),
+            path,
             probe,
             processes: processes.unwrap_or_default(),
             used: now,
             retried: now + spent + pause,
             pause,
-            is_installed: false,
+            installed,
         };
         self.libraries.insert(id.clone(), library);
         failed
@@ -267,12 +350,16 @@ mod tests {
         (Attachments::new("", attach), attempts)
     }
 
+    fn id(inode: u64) -> LibraryId {
+        LibraryId {
+            device: "fe:00".to_owned(),
+            inode,
+        }
+    }
+
     fn processes(libraries: u64) -> Processes {
         let libraries = (1..=libraries).map(|inode| Mapped {
-            id: LibraryId {
-                device: "fe:00".to_owned(),
-                inode,
-            },
+            id: id(inode),
             path: "/libtracetools.so".into(),
             range: String::new(),
         });
@@ -293,6 +380,96 @@ mod tests {
         attachments.follow(&processes, Instant::now(), broker);
         assert_eq!(attempts.load(Ordering::Relaxed), 4);
         assert_eq!(attachments.facts().len(), 4);
+    }
+
+    /// Attachments that count their attempts, with an installed library at `path`. Its probe is a
+    /// second reference to the counter.
+    fn with_installed(path: &Path) -> (Attachments<Arc<AtomicU32>>, Arc<AtomicU32>) {
+        let attempts = Arc::<AtomicU32>::default();
+        let counter = Arc::clone(&attempts);
+        let attach: Attach<Arc<AtomicU32>> = Box::new(move |_, _| {
+            counter.fetch_add(1, Ordering::Relaxed);
+            Ok(Arc::clone(&counter))
+        });
+        let mut attachments = Attachments::new("", attach);
+        let now = Instant::now();
+        let library = Known {
+            path: path.to_owned(),
+            probe: Ok(Arc::clone(&attempts)),
+            processes: 0,
+            used: now,
+            retried: now,
+            pause: RETRY_DELAY,
+            installed: Version::of(path),
+        };
+        attachments.libraries.insert(id(1), library);
+        attachments.is_installed = true;
+        (attachments, attempts)
+    }
+
+    fn is_attached(attachments: &Attachments<Arc<AtomicU32>>) -> bool {
+        attachments.probe(&id(1)).is_some_and(Result::is_ok)
+    }
+
+    #[test]
+    fn an_installed_library_that_is_written_in_place_has_no_probe_until_it_is_complete() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("libtracetools.so");
+        fs::write(&path, "first").unwrap();
+        let (mut attachments, attempts) = with_installed(&path);
+        let (processes, broker) = (processes(1), &mut Broker::here());
+        let start = Instant::now();
+        assert!(!attachments.detach_written(start));
+        assert!(is_attached(&attachments) && attachments.is_installed());
+
+        let probes = Arc::strong_count(&attempts);
+        for (text, tenths) in [("sec", 0), ("second", 5)] {
+            fs::write(&path, text).unwrap();
+            let now = start + Duration::from_millis(100 * tenths);
+            assert!(attachments.detach_written(now));
+            assert!(!is_attached(&attachments) && !attachments.is_installed());
+            assert_eq!(Arc::strong_count(&attempts), probes - 1, "detached");
+            attachments.follow(&processes, now, broker);
+        }
+        let nearly = start + Duration::from_millis(1400);
+        assert!(attachments.detach_written(nearly), "it waits");
+        attachments.follow(&processes, nearly, broker);
+        assert_eq!(attempts.load(Ordering::Relaxed), 0);
+        let [facts] = &attachments.facts()[..] else {
+            panic!("one library");
+        };
+        assert_eq!(facts.refused.as_deref(), Some(WRITTEN));
+
+        let later = start + Duration::from_millis(1500);
+        attachments.follow(&processes, later, broker);
+        assert_eq!(attempts.load(Ordering::Relaxed), 1);
+        assert!(is_attached(&attachments));
+        // The library stays an installed one.
+        fs::write(&path, "third version").unwrap();
+        assert!(attachments.detach_written(later));
+        assert!(!is_attached(&attachments));
+    }
+
+    #[test]
+    fn an_installed_library_that_another_file_replaces_keeps_its_probe_for_a_while() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("libtracetools.so");
+        fs::write(&path, "first").unwrap();
+        let (mut attachments, _) = with_installed(&path);
+        let new = path.with_extension("new");
+        fs::write(&new, "second").unwrap();
+        fs::rename(new, &path).unwrap();
+        let start = Instant::now();
+        assert!(
+            attachments.detach_written(start),
+            "the new file has no probe"
+        );
+        assert!(is_attached(&attachments) && !attachments.is_installed());
+        let (nobody, broker) = (processes(0), &mut Broker::here());
+        attachments.follow(&nobody, start, broker);
+        assert!(is_attached(&attachments));
+        attachments.follow(&nobody, start + DETACH_DELAY, broker);
+        assert!(attachments.probe(&id(1)).is_none());
     }
 
     #[test]

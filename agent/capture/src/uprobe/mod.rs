@@ -25,8 +25,9 @@ use super::filter_reader::FilterReader;
 use super::reorder_buffer::ReorderBuffer;
 use super::shm::directories::Scope;
 use super::system::Clocks;
+use crate::container::{add, is_service};
 use crate::threads::Spawn;
-use ros2probe_attach::client::Broker;
+use ros2probe_attach::client::{Broker, is_listening};
 use ros2probe_model::observe::input::Input;
 use ros2probe_model::observe::observer::Observer;
 use rustix::thread::{CapabilitySet, capabilities};
@@ -52,6 +53,9 @@ pub enum UprobeError {
         #[source]
         source: io::Error,
     },
+    /// The kernel programs identify processes by other ids than this process.
+    #[error("process ids are not the host's{}", add("--pid host"))]
+    OwnProcesses,
     /// The kernel does not expose a process's control group to programs.
     #[error("uprobes limited to one control group (capture.cgroup) need Linux 5.16")]
     Scope(#[source] FilterError),
@@ -85,13 +89,15 @@ pub fn usable_capabilities() -> CapabilitySet {
     required | CapabilitySet::CHECKPOINT_RESTORE | CapabilitySet::DAC_READ_SEARCH
 }
 
-/// Returns a client of the broker that listens at `socket`. If the socket does not exist, a process
-/// with the required capabilities starts the broker as a child.
+/// Returns a client of the broker at `socket`. Without a listener there, a process with the
+/// required capabilities starts the broker as a child. A service does so only as root: where an operator has
+/// masked the socket, capabilities that other sources need permit no breakpoints.
 ///
 /// # Errors
 /// Fails if the child cannot be started.
 pub(crate) fn broker(socket: &Path) -> Result<Broker, UprobeError> {
-    match !socket.exists() && missing().is_empty() {
+    let may_start = !is_service() || rustix::process::geteuid().is_root();
+    match may_start && missing().is_empty() && !is_listening(socket) {
         true => Broker::start().map_err(UprobeError::Start),
         false => Ok(Broker::at(socket)),
     }

@@ -16,7 +16,7 @@ use ros2probe_attach::client::Broker;
 use ros2probe_attach::functions::Library;
 use ros2probe_attach::mapped::Mapped;
 
-use super::attachments::{Attachments, LibraryFacts};
+use super::attachments::{Attachments, LibraryFacts, RETRY_DELAY};
 use super::processes::Processes;
 use crate::bell::Bell;
 use crate::breakpoints::Attached;
@@ -61,8 +61,8 @@ pub struct Facts {
 
 struct Shared {
     facts: Mutex<Facts>,
-    /// Whether all processes are covered. Also set until the first search ends: it takes a moment,
-    /// and installed libraries already have probes.
+    /// Whether all processes are covered. Until the first search ends, also set if installed
+    /// libraries have probes.
     covers_all: AtomicBool,
     /// Whether every message is needed.
     wanted: AtomicBool,
@@ -79,13 +79,14 @@ struct Shared {
 }
 
 impl Facts {
-    /// Returns the facts while probes are attached on demand and not needed.
-    fn idle() -> Self {
+    /// Returns the facts while probes are attached on demand and not needed. `failed` is the reason
+    /// why the broker does not answer: without it, a demand would attach nothing.
+    fn idle(failed: Option<String>) -> Self {
         Self {
             libraries: Vec::new(),
-            uncovered: Some(IDLE_REASON.to_owned()),
+            is_resting: failed.is_none(),
+            uncovered: failed.or_else(|| Some(IDLE_REASON.to_owned())),
             has_inspected: true,
-            is_resting: true,
         }
     }
 }
@@ -116,7 +117,7 @@ impl LibrarySearch {
         let shared = Arc::new(Shared {
             facts: Mutex::default(),
             progress,
-            covers_all: AtomicBool::new(true),
+            covers_all: AtomicBool::new(attachments.is_installed()),
             wanted: AtomicBool::new(!on_demand),
             bell: Bell::new().ok(),
             attached: AtomicBool::new(true),
@@ -144,6 +145,7 @@ impl LibrarySearch {
         let work = Box::new(move || follow(&shared, attachments, scope, broker));
         let spawned = spawn(Task::Probes, thread, work);
         if spawned.is_err() {
+            self.shared.covers_all.store(false, Ordering::Release);
             let facts = self.shared.facts.lock();
             // No process will be inspected, so readiness must not wait for it.
             facts.unwrap_or_else(PoisonError::into_inner).has_inspected = true;
@@ -216,6 +218,7 @@ fn follow(shared: &Shared, attachments: Attachments<Attached>, scope: Scope, bro
         failed: None,
         mappings: None,
         without_mappings: None,
+        asked: Instant::now(),
         starting_until: Instant::now() + STARTUP_TIME,
     };
     let mut shared_memory = ShmDirectories::new(scope);
@@ -227,16 +230,18 @@ fn follow(shared: &Shared, attachments: Attachments<Attached>, scope: Scope, bro
         shared.progress.step();
         let is_starting = Instant::now() < followed.starting_until;
         if !shared.wanted.load(Ordering::Acquire) && !is_starting {
+            somebody_came = true;
+            asked_all = None;
             if shared.attached.load(Ordering::Acquire) {
                 // Polling of shared memory resumes before the probes are detached.
-                shared.report(Facts::idle());
-                std::thread::sleep(DETACH_OVERLAP);
+                shared.report(Facts::idle(followed.failed.clone()));
+                if followed.has_start_within(DETACH_OVERLAP) {
+                    continue;
+                }
                 followed.detach_all();
                 shared.attached.store(false, Ordering::Release);
                 tracing::info!("no longer attached: no samples are read");
             }
-            somebody_came = true;
-            asked_all = None;
             followed.wait_for_demand(shared);
             continue;
         }
@@ -284,16 +289,22 @@ struct Followed {
     mappings: Option<MappingEvents>,
     /// The last logged reason why `mappings` is empty.
     without_mappings: Option<Reason>,
+    /// Time of the last request for all processes.
+    asked: Instant,
     /// End of the time in which a process that has started announces its names.
     starting_until: Instant,
 }
 
 impl Followed {
     fn find(&mut self, all: bool, now: Instant) {
+        self.attachments.detach_written(now);
+        // Processes may have started while the events were lost.
+        let all = MappingEvents::drop_stale(&mut self.mappings) || all;
         // Installed libraries come first: a process that starts announces its names immediately.
         self.install(now);
         let found = self.processes.find(all, &mut self.broker);
         self.failed = found.err().map(|error| in_words(&error));
+        self.asked = Instant::now();
         // The broker may have started after the agent.
         self.install(now);
         self.attachments
@@ -335,12 +346,52 @@ impl Followed {
         let ready = wait(&descriptors, INSPECTION_INTERVAL);
         shared.progress.step();
         shared.bell.iter().for_each(Bell::drain);
-        let new = self.take_mapped();
-        if new.is_incomplete || self.processes.are_in_scope(&new.processes) {
-            self.starting_until = Instant::now() + STARTUP_TIME;
-        } else if matches!(ready, Ok(Some(_))) {
+        if !self.note_start() && matches!(ready, Ok(Some(_))) {
             std::thread::sleep(UNRELATED_DELAY);
         }
+        self.ask_again(shared);
+    }
+
+    /// Repeats the request to a broker that did not answer: it may have started after the agent.
+    fn ask_again(&mut self, shared: &Shared) {
+        if self.failed.is_none() || self.asked.elapsed() < RETRY_DELAY {
+            return;
+        }
+        let answered = self.broker.processes();
+        self.asked = Instant::now();
+        self.failed = answered.err().map(|error| in_words(&error));
+        if self.failed.is_none() {
+            // Processes may have started in the meantime.
+            self.starting_until = self.asked + STARTUP_TIME;
+            return;
+        }
+        self.broker.disconnect();
+        shared.report(Facts::idle(self.failed.clone()));
+    }
+
+    /// Waits, and returns whether a process starts in this time. The rings are read all the while:
+    /// on a machine that starts many programs they would overflow.
+    fn has_start_within(&mut self, limit: Duration) -> bool {
+        let end = Instant::now() + limit;
+        while Instant::now() < end {
+            std::thread::sleep(EVENT_DELAY);
+            if self.note_start() {
+                return true;
+            }
+        }
+        false
+    }
+
+    /// Reads the rings, and returns whether a process in scope may have mapped a library. Its
+    /// names are announced from now on.
+    fn note_start(&mut self) -> bool {
+        let new = self.take_mapped();
+        let has_lost_events = MappingEvents::drop_stale(&mut self.mappings) || new.is_incomplete;
+        let is_start = has_lost_events || self.processes.are_in_scope(&new.processes);
+        if is_start {
+            self.starting_until = Instant::now() + STARTUP_TIME;
+        }
+        is_start
     }
 
     fn take_mapped(&mut self) -> NewMappings {
@@ -470,8 +521,9 @@ fn uncovered(attachments: &Attachments<Attached>, processes: &Processes) -> Opti
 mod tests {
     use std::fs;
     use std::os::fd::AsRawFd as _;
+    use std::path::Path;
 
-    use super::super::attachments::{DETACH_DELAY, RETRY_DELAY};
+    use super::super::attachments::{DETACH_DELAY, Refusal};
     use super::super::processes::Use;
     use super::*;
     use crate::breakpoints::AttachMethod;
@@ -494,6 +546,89 @@ mod tests {
             )
         };
         assert_ne!(mapped, libc::MAP_FAILED, "{}", io::Error::last_os_error());
+    }
+
+    /// A thread's state with events of mapped files, and without probes.
+    fn followed() -> Followed {
+        let mut broker = Broker::here();
+        let mappings = MappingEvents::open(&mut broker)
+            .expect("records of all processes need root: run the tests with sudo");
+        let refuse = |_: &mut _, _| Err(Refusal::Program("no program".into()));
+        Followed {
+            processes: Processes::new(Scope::Directories(Vec::new()), Library::FastDds),
+            attachments: Attachments::new("", Box::new(refuse)),
+            broker,
+            failed: None,
+            mappings: Some(mappings),
+            without_mappings: None,
+            asked: Instant::now(),
+            starting_until: Instant::now(),
+        }
+    }
+
+    #[test]
+    fn many_started_programs_of_other_kinds_do_not_delay_the_detachment() {
+        let mut followed = followed();
+        let is_over = Arc::new(AtomicBool::default());
+        let is_asked_to_end = Arc::clone(&is_over);
+        let others = std::thread::spawn(move || {
+            let program = fs::File::open("/proc/self/exe").unwrap();
+            let kind = libc::PROT_READ | libc::PROT_EXEC;
+            while !is_asked_to_end.load(Ordering::Acquire) {
+                for _ in 0..3 {
+                    let (any, private) = (std::ptr::null_mut(), libc::MAP_PRIVATE);
+                    // SAFETY: a new mapping at an address of the kernel's choice.
+                    let mapped =
+                        unsafe { libc::mmap(any, 1, kind, private, program.as_raw_fd(), 0) };
+                    assert_ne!(mapped, libc::MAP_FAILED);
+                    // SAFETY: the mapping was created above, and nothing refers to it.
+                    unsafe { libc::munmap(mapped, 1) };
+                }
+                std::thread::sleep(Duration::from_millis(1));
+            }
+        });
+        let has_start = followed.has_start_within(2 * DETACH_OVERLAP);
+        is_over.store(true, Ordering::Release);
+        others.join().unwrap();
+        assert!(!has_start, "the rings lost records");
+        assert!(followed.starting_until <= Instant::now());
+    }
+
+    #[test]
+    fn a_broker_that_starts_later_is_asked_at_rest() {
+        let mut followed = followed();
+        let shared = Shared {
+            facts: Mutex::default(),
+            progress: Arc::default(),
+            covers_all: AtomicBool::new(false),
+            wanted: AtomicBool::new(false),
+            bell: None,
+            attached: AtomicBool::new(false),
+            has_inspected_all: AtomicBool::default(),
+            on_demand: true,
+            stop: AtomicBool::new(false),
+        };
+        let reason = || Some("nobody listens".to_owned());
+        followed.failed = reason();
+        followed.ask_again(&shared);
+        assert_eq!(followed.failed, reason(), "the pause is not over");
+        followed.asked -= RETRY_DELAY;
+        followed.ask_again(&shared);
+        assert_eq!(followed.failed, None);
+        assert!(followed.starting_until > Instant::now(), "it attaches");
+
+        followed.broker = Broker::at(Path::new("/nonexistent/broker.sock"));
+        followed.failed = reason();
+        followed.asked -= RETRY_DELAY;
+        followed.ask_again(&shared);
+        let facts = shared.facts.lock().unwrap().clone();
+        let uncovered = facts.uncovered.unwrap();
+        assert!(
+            uncovered.contains("cannot connect to the broker"),
+            "{uncovered}"
+        );
+        assert!(!facts.is_resting);
+        assert!(Facts::idle(None).is_resting);
     }
 
     #[test]

@@ -14,7 +14,7 @@ use ros2probe_attach::request::{AttachMethod, MAX_PACKET, Place};
 use rustix::net::sockopt::{Timeout, set_socket_timeout};
 use rustix::net::{
     AddressFamily, RecvFlags, SendAncillaryBuffer, SendAncillaryMessage, SendFlags, SocketAddrUnix,
-    SocketFlags, SocketType, connect, recv, sendmsg, socket_with,
+    SocketFlags, SocketType, bind, connect, listen, recv, sendmsg, socket_with,
 };
 use serde_json::{Value, json};
 use tempfile::TempDir;
@@ -255,6 +255,41 @@ fn processes_with_a_library_are_listed_with_name_and_domain_and_others_are_not_r
     assert_eq!(broker.domain(process.id()).unwrap(), Some(42));
     // The agent must not read the environment of other processes.
     assert_eq!(broker.domain(own).unwrap(), None);
+}
+
+/// systemd holds the listening socket, and starts a broker at each connection without one.
+#[test]
+fn a_broker_whose_program_was_replaced_leaves_the_next_connection_to_the_new_one() {
+    let directory = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap();
+    let (path, program) = (
+        directory.path().join("attach.sock"),
+        directory.path().join("rp"),
+    );
+    let kind = SocketType::SEQPACKET;
+    let listener = socket_with(AddressFamily::UNIX, kind, SocketFlags::CLOEXEC, None).unwrap();
+    bind(&listener, &SocketAddrUnix::new(&path).unwrap()).unwrap();
+    listen(&listener, 8).unwrap();
+    let start = || {
+        fs::hard_link(env!("CARGO_BIN_EXE_rp"), &program).unwrap();
+        Command::new(&program)
+            .args(["attach", "--user", "root"])
+            .stdin(listener.try_clone().unwrap())
+            .spawn()
+            .unwrap()
+    };
+    let mut old = start();
+    let mut agent = Broker::at(&path);
+    agent.processes().unwrap();
+    fs::remove_file(&program).unwrap();
+    // The connection of the old agent stays until another one begins.
+    agent.processes().unwrap();
+    let asking = std::thread::spawn(move || Broker::at(&path).processes());
+    assert!(old.wait().unwrap().success());
+    let mut new = start();
+    let answer = asking.join().unwrap();
+    new.kill().unwrap();
+    new.wait().unwrap();
+    answer.unwrap();
 }
 
 #[test]
