@@ -164,7 +164,19 @@ pub struct Missed {
     /// `unannounced`: the message arrived before its writer's announcement and was not sent again.
     /// `not_captured`: the agent could not capture the message. `queue_full`: this client read too
     /// slowly.
-    pub reason: MissedReason,
+    #[cfg_attr(feature = "openapi", schema(value_type = MissedReason))]
+    pub reason: crate::Open<MissedReason>,
+}
+
+impl Missed {
+    /// Returns the reason. One of a newer agent counts as [`MissedReason::NotCaptured`].
+    #[must_use]
+    pub const fn known_reason(&self) -> MissedReason {
+        match self.reason {
+            crate::Open::Known(reason) => reason,
+            crate::Open::Unknown(_) => MissedReason::NotCaptured,
+        }
+    }
 }
 
 /// Why messages are missing from the stream.

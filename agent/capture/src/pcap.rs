@@ -92,9 +92,12 @@ pub enum PcapError {
         /// Link layer of the packets.
         link: Link,
     },
-    /// The file is neither pcap nor pcapng.
-    #[error("not a capture: it begins with {0:02x?}, which is neither pcap nor pcapng")]
-    NotACapture([u8; 4]),
+    /// The file is neither pcap nor pcapng. Its first bytes, at most 4.
+    #[error(
+        "not a capture: it begins with {0:02x?}, as neither pcap nor pcapng does; bags are read \
+         from their directory, or from a file that ends in .mcap or .db3"
+    )]
+    NotACapture(Vec<u8>),
     /// Reading failed (disk, damaged gzip stream).
     #[error("cannot read the capture beyond packet {packets}")]
     Read {
@@ -195,11 +198,11 @@ impl PcapReader {
         expansion: Expansion,
     ) -> Result<Self, PcapError> {
         let mut source: Box<dyn Read + Send> = Box::new(BufReader::new(source));
-        let mut magic: [u8; 4] = array(&mut source, "file header", 0)?;
+        let mut magic = magic_of(&mut source)?;
         if magic.starts_with(&GZIP_MAGIC) {
             let whole = io::Cursor::new(magic).chain(source);
             source = Box::new(BufReader::new(Gunzip::new(whole, expansion)));
-            magic = array(&mut source, "file header", 0)?;
+            magic = magic_of(&mut source)?;
         }
         let format = if magic == next_generation::MAGIC {
             Format::NextGeneration(Section::open(&mut source)?)
@@ -277,13 +280,18 @@ impl PcapReader {
 }
 
 impl Classic {
+    /// The first bytes of a file, their byte order, and the nanoseconds of a unit of time.
+    const MAGIC: [([u8; 4], Endianness, u64); 4] = [
+        ([0xa1, 0xb2, 0xc3, 0xd4], Endianness::Big, 1000),
+        ([0xd4, 0xc3, 0xb2, 0xa1], Endianness::Little, 1000),
+        ([0xa1, 0xb2, 0x3c, 0x4d], Endianness::Big, 1),
+        ([0x4d, 0x3c, 0xb2, 0xa1], Endianness::Little, 1),
+    ];
+
     fn open(magic: [u8; 4], source: &mut dyn Read) -> Result<Self, PcapError> {
-        let (endianness, nanoseconds_per_unit) = match magic {
-            [0xa1, 0xb2, 0xc3, 0xd4] => (Endianness::Big, 1000),
-            [0xd4, 0xc3, 0xb2, 0xa1] => (Endianness::Little, 1000),
-            [0xa1, 0xb2, 0x3c, 0x4d] => (Endianness::Big, 1),
-            [0x4d, 0x3c, 0xb2, 0xa1] => (Endianness::Little, 1),
-            _ => return Err(PcapError::NotACapture(magic)),
+        let form = Self::MAGIC.iter().find(|form| form.0 == magic);
+        let Some(&(_, endianness, nanoseconds_per_unit)) = form else {
+            return Err(PcapError::NotACapture(magic.to_vec()));
         };
         let header: [u8; 20] = array(source, "file header", 0)?;
         let mut cursor = Cursor::new(&header, endianness);
@@ -382,6 +390,31 @@ fn fill(
         }
     }
     Ok(filled)
+}
+
+/// Reads the first bytes of a file. A shorter file is cut off if it begins like a capture.
+fn magic_of(mut source: &mut dyn Read) -> Result<[u8; 4], PcapError> {
+    const WHAT: &str = "file header";
+    let mut magic = [0; 4];
+    let length = fill(&mut source, &mut magic, WHAT, 0)?;
+    if length == magic.len() {
+        return Ok(magic);
+    }
+    let read = magic.get(..length).unwrap_or_default();
+    let classic = Classic::MAGIC.map(|(magic, ..)| magic);
+    let mut magics = classic.iter().chain([&next_generation::MAGIC]);
+    let is_gzip = read
+        .iter()
+        .zip(&GZIP_MAGIC)
+        .all(|(one, other)| one == other);
+    let is_capture = is_gzip || magics.any(|one| one.starts_with(read));
+    Err(match is_capture {
+        true => PcapError::Truncated {
+            packets: 0,
+            what: WHAT,
+        },
+        false => PcapError::NotACapture(read.to_vec()),
+    })
 }
 
 fn array<const N: usize>(

@@ -32,5 +32,5 @@ pub use manifest::{Manifest, ManifestFile};
 pub use settings::{Settings, SettingsError, SpaceLimits, is_destination};
 pub use shipper::{Findings, Observer, ShipError, Shipper};
 pub use state::{RECORDS_DIRECTORY, is_delivered};
-pub use status::{Delivered, Failure, Status, Uploading};
+pub use status::{Delivered, Failure, Status, StatusError, Uploading};
 pub use windows::{InvalidWindow, Window, Windows};

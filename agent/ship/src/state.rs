@@ -141,7 +141,7 @@ impl Records {
             let name = path.file_stem().and_then(|name| name.to_str());
             // A damaged record counts as missing: the bag is compared with the destination.
             if let Some(name) = name.filter(|_| is_record)
-                && let Some(mut delivery) = read_json::<Delivery>(&path)
+                && let Ok(mut delivery) = read_json::<Delivery>(&path)
             {
                 if !delivery.is_delivered {
                     delivery.forget_sizes();
@@ -216,11 +216,12 @@ pub fn is_delivered(state: &Path, bag: &Path) -> bool {
         .is_some_and(|(receipt, found)| receipt == found.text())
 }
 
-/// Reads a file of JSON; `None` if it cannot be used.
-pub(crate) fn read_json<T: DeserializeOwned>(path: &Path) -> Option<T> {
-    let is_short = fs::metadata(path).ok()?.len() <= RECORD_BYTES;
-    let text = is_short.then(|| fs::read(path).ok())??;
-    serde_json::from_slice(&text).ok()
+/// Reads a file of JSON. The error of a damaged file has the kind `InvalidData` or `UnexpectedEof`.
+pub(crate) fn read_json<T: DeserializeOwned>(path: &Path) -> io::Result<T> {
+    if fs::metadata(path)?.len() > RECORD_BYTES {
+        return Err(io::ErrorKind::InvalidData.into());
+    }
+    Ok(serde_json::from_slice(&fs::read(path)?)?)
 }
 
 /// Replaces a file of JSON, which then survives a loss of power.

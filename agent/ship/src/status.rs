@@ -8,6 +8,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::state::{read_json, write_json_unsynced};
 
+/// Name of the file.
+const FILE: &str = "status.json";
+
 /// State of a delivery.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Status {
@@ -72,14 +75,40 @@ pub struct Failure {
     pub at: String,
 }
 
+/// Why the state of a delivery cannot be read.
+#[derive(Debug, thiserror::Error)]
+pub enum StatusError {
+    /// No shipper has left a state.
+    #[error("no delivery has begun: {} has no {FILE}", .0.display())]
+    Missing(PathBuf),
+    /// This user may not read it.
+    #[error("cannot read {}: use sudo, or join the group ros2probe", .0.display())]
+    Denied(PathBuf),
+    /// A loss of power can leave an empty file.
+    #[error("{} is damaged: `rp ship` replaces it", .0.display())]
+    Damaged(PathBuf),
+    /// The disk refuses.
+    #[error("cannot read {}", .0.display())]
+    Read(PathBuf, #[source] io::Error),
+}
+
 /// Maximum number of bags that are listed.
 pub(crate) const MAX_LISTED: usize = 100;
 
 impl Status {
-    /// Reads the state that a shipper left in its directory; `None` without one.
-    #[must_use]
-    pub fn read(directory: &Path) -> Option<Self> {
-        read_json(&path(directory))
+    /// Reads the state that a shipper left in its directory.
+    ///
+    /// # Errors
+    ///
+    /// Fails if no shipper has left one, or if it cannot be read.
+    pub fn read(directory: &Path) -> Result<Self, StatusError> {
+        let path = path(directory);
+        read_json(&path).map_err(|error| match error.kind() {
+            io::ErrorKind::NotFound => StatusError::Missing(directory.to_owned()),
+            io::ErrorKind::PermissionDenied => StatusError::Denied(path),
+            io::ErrorKind::InvalidData | io::ErrorKind::UnexpectedEof => StatusError::Damaged(path),
+            _ => StatusError::Read(path, error),
+        })
     }
 
     /// Writes the state. It is not forced to the disk: no delivery depends on it.
@@ -109,5 +138,5 @@ pub(crate) fn now() -> String {
 }
 
 fn path(directory: &Path) -> PathBuf {
-    directory.join("status.json")
+    directory.join(FILE)
 }

@@ -331,12 +331,15 @@ fn an_excessive_length_in_the_file_is_rejected() {
 
 #[test]
 fn a_file_that_is_not_a_capture_is_reported() {
-    let (_, error) = read(b"%PDF-1.7 and so on");
-    let text = error.unwrap().to_string();
-    assert_eq!(
-        text,
-        "not a capture: it begins with [25, 50, 44, 46], which is neither pcap nor pcapng"
-    );
+    for (bytes, begin) in [
+        (&b"%PDF-1.7 and so on"[..], "[25, 50, 44, 46]"),
+        (b"no\n", "[6e, 6f, 0a]"),
+    ] {
+        let (_, error) = read(bytes);
+        let text = error.unwrap().to_string();
+        let expected = format!("not a capture: it begins with {begin}, as neither pcap nor pcapng");
+        assert!(text.starts_with(&expected), "{text}");
+    }
     let missing = PcapReader::open(Path::new("/nonexistent/x.pcap"), Expansion::Limited)
         .err()
         .unwrap()

@@ -177,7 +177,13 @@ impl Ci {
         session.observe(&agent, &mut process, &signals)?;
         let bag = process.bag(&agent, self.no_bag);
         process.end()?;
-        let bag = artefacts.keep_bag(&process.recording(), bag)?;
+        let bag = artefacts.keep_bag(&process.recording(), bag);
+        // Without its bag, a run still has a verdict.
+        let bag = bag.unwrap_or_else(|error| {
+            let error = format!("{error:#}");
+            print(&error);
+            format!("not kept: {error}")
+        });
         let Session { seen, run, .. } = session;
         let conditions = judge(&run, &seen);
         artefacts.write(

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeSet;
 use std::process::ExitCode;
+use std::time::Instant;
 
 use anyhow::Result;
 use bytes::Bytes;
@@ -147,7 +148,10 @@ impl Echo {
             output,
             expected,
             is_known: known.is_some(),
-            start: None,
+            timer: Timer {
+                is_replay: is_waiting,
+                start: None,
+            },
             is_seen: false,
         };
         let status = follow(&agent, domain_id, names, &mut notes, |item, now| {
@@ -219,14 +223,33 @@ struct Printer<'a> {
     expected: Option<String>,
     /// Whether the topic was known before its first message.
     is_known: bool,
-    /// Time of the first item, in nanoseconds.
-    start: Option<i64>,
+    timer: Timer,
     is_seen: bool,
+}
+
+/// Time since the first item of a stream.
+struct Timer {
+    is_replay: bool,
+    /// Time of the first item, here and by its stream in nanoseconds.
+    start: Option<(Instant, i64)>,
+}
+
+impl Timer {
+    /// Returns the seconds until an item of this time. A capture has its own time. The clock of a
+    /// live agent may be set, so it does not count.
+    fn seconds(&mut self, now: i64) -> f64 {
+        let start = || (Instant::now(), now);
+        let (begun, first) = *self.start.get_or_insert_with(start);
+        match self.is_replay {
+            true => elapsed(first, now),
+            false => begun.elapsed().as_secs_f64(),
+        }
+    }
 }
 
 impl Printer<'_> {
     fn print(&mut self, item: StreamItem<'_>, now: i64) -> Result<StreamStatus> {
-        let start = *self.start.get_or_insert(now);
+        let seconds = self.timer.seconds(now);
         let mut is_enough = false;
         match item {
             StreamItem::Clock => {}
@@ -241,7 +264,7 @@ impl Printer<'_> {
             }
         }
         let timeout = self.command.timeout;
-        is_enough |= timeout.is_some_and(|timeout| elapsed(start, now) >= timeout);
+        is_enough |= timeout.is_some_and(|timeout| seconds >= timeout);
         Ok(if is_enough {
             StreamStatus::Stopped
         } else {
@@ -343,4 +366,34 @@ fn parse_positive(text: &str) -> Result<f64, UserError> {
 
 fn user_error(refused: Refused) -> anyhow::Error {
     UserError(refused.0).into()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_step_of_a_live_agents_clock_ends_no_timeout() {
+        const HOUR: i64 = 3_600_000_000_000;
+        for step in [HOUR, -HOUR] {
+            let timer = |is_replay| Timer {
+                is_replay,
+                start: None,
+            };
+            let mut live = timer(false);
+            assert!(live.seconds(0) < 1800.0);
+            assert!((0.0..1800.0).contains(&live.seconds(step)), "{step}");
+            let mut replayed = timer(true);
+            assert_eq!(replayed.seconds(step), 0.0);
+            assert_eq!(replayed.seconds(step + HOUR), 3600.0);
+        }
+        // Time passes also while the clock does not.
+        let mut live = Timer {
+            is_replay: false,
+            start: Instant::now()
+                .checked_sub(std::time::Duration::from_secs(2))
+                .map(|begun| (begun, HOUR)),
+        };
+        assert!(live.seconds(0) >= 2.0);
+    }
 }

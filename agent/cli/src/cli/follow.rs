@@ -148,7 +148,7 @@ pub(crate) fn follow(
             }
             Line::Clock(clock) => {
                 now = now.max(Some(clock.time_ns));
-                notes.now()?;
+                notes.now();
                 visit(StreamItem::Clock, clock.time_ns)?
             }
             Line::Missed(missed) => {
@@ -159,11 +159,11 @@ pub(crate) fn follow(
                 }
             }
             Line::End(end) if end.reason == END_OF_CAPTURE => {
-                notes.end()?;
+                notes.end();
                 return Ok(StreamStatus::CaptureEnded);
             }
             Line::End(_) if agent.outcome().is_some() => {
-                notes.end()?;
+                notes.end();
                 return Ok(StreamStatus::CaptureTruncated);
             }
             Line::End(_) => break,

@@ -17,6 +17,7 @@ use jiff::{Timestamp, Unit};
 use ros2probe::client::{Agent, Lines, Next, Target};
 use ros2probe::learn::watchlist::{Source, is_expected, parameters, text};
 use ros2probe::learn::{Learner, Learnt, MAX_SECONDS, Selection};
+use ros2probe_api::health::Health;
 use ros2probe_api::parameters::Parameters;
 use ros2probe_api::path::encoded;
 use ros2probe_api::topics::TopicList;
@@ -76,6 +77,7 @@ impl Learn {
             is_hidden: !selection.patterns().is_empty(),
             query: query(&selection),
             learner: Learner::new(selection),
+            begin: None,
             stop: super::interrupt::flag().context("cannot handle signals")?,
             progress: Progress::new(is_whole),
         };
@@ -126,6 +128,8 @@ struct Session {
     /// Selection of topics in the syntax of `/samples`.
     query: String,
     learner: Learner,
+    /// Begin of a live session; `None` if views have the times of a capture.
+    begin: Option<Instant>,
     stop: Arc<AtomicBool>,
     progress: Progress,
 }
@@ -136,6 +140,10 @@ impl Session {
         let (query, domain_id) = (&self.query, self.domain_id);
         let path = format!("/samples?{query}&domain_id={domain_id}&queue_bytes={QUEUE_BYTES}");
         let mut lines = agent.stream(&path)?;
+        // A replay has the times of its capture, at any speed.
+        let health = agent.get::<Health>("/health");
+        let is_replay = health.is_ok_and(|health| health.source == "replay");
+        self.begin = (!is_replay).then(Instant::now);
         self.view_until_end(&mut lines, agent)?;
         let begin = Instant::now();
         let end = begin + Duration::from_secs(self.seconds.into());
@@ -197,7 +205,9 @@ impl Session {
         let (domain_id, hidden) = (self.domain_id, self.is_hidden);
         let path = format!("/topics?domain_id={domain_id}&hidden={hidden}");
         let list: TopicList<'_> = agent.get(&path)?;
-        self.learner.observe(&list);
+        let begin = self.begin;
+        let at = begin.map_or(list.timestamp_seconds, |it| it.elapsed().as_secs_f64());
+        self.learner.observe(&list, at);
         self.progress.show(&self.learner, self.seconds);
         Ok(())
     }

@@ -6,7 +6,6 @@ use std::collections::{BTreeMap, HashSet};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use anyhow::Result;
 use ros2probe::client::{Agent, ClientError};
 use ros2probe_api::Open;
 use ros2probe_api::health::Health;
@@ -124,7 +123,7 @@ impl<'a> Notes<'a> {
 
     /// Records messages that will not arrive.
     pub(crate) fn missed(&mut self, missed: &Missed) {
-        let why = match missed.reason {
+        let why = match missed.known_reason() {
             MissedReason::QueueFull => "were dropped: too slow here",
             MissedReason::NotCaptured => "could not be captured",
             MissedReason::Unannounced => "were sent before their publisher was announced",
@@ -137,30 +136,30 @@ impl<'a> Notes<'a> {
     }
 
     /// Reports once why no message arrived, after [`SILENCE_TIMEOUT`].
-    pub(crate) fn now(&mut self) -> Result<()> {
+    pub(crate) fn now(&mut self) {
         Missing::all().report(false);
-        if self.is_replay || self.is_explained || self.begun.elapsed() < SILENCE_TIMEOUT {
-            return Ok(());
+        if !self.is_replay && self.begun.elapsed() >= SILENCE_TIMEOUT {
+            self.print_explanation();
         }
-        self.print_explanation()
     }
 
     /// At the end of the stream, reports missing messages and the reason for silence.
-    pub(crate) fn end(&mut self) -> Result<()> {
+    pub(crate) fn end(&mut self) {
         Missing::all().report(true);
-        if self.is_explained {
-            return Ok(());
-        }
-        self.print_explanation()
+        self.print_explanation();
     }
 
-    fn print_explanation(&mut self) -> Result<()> {
-        self.is_explained = true;
+    /// Prints the explanation, once. Failed requests are ignored, because it is only a hint: the
+    /// stream reports an agent that has ended.
+    fn print_explanation(&mut self) {
+        if std::mem::replace(&mut self.is_explained, true) {
+            return;
+        }
         if self.are_parts && !self.received_topics.is_empty() {
-            return Ok(());
+            return;
         }
         if self.names.is_empty() && self.received_topics.is_empty() {
-            names_of(self.agent, self.domain_id)?;
+            let _ = names_of(self.agent, self.domain_id);
         }
         for name in &self.names {
             if self.received_topics.contains(name) {
@@ -177,12 +176,11 @@ impl<'a> Notes<'a> {
                 Err(error @ ClientError::Refused(_)) if error.is(Code::NoSuchTopic) => {
                     let detail = error.to_string();
                     eprintln!("rp: no message on {}: {}", visible(name), visible(&detail));
-                    names_of(self.agent, self.domain_id)?;
+                    let _ = names_of(self.agent, self.domain_id);
                 }
-                Err(error) => return Err(error.into()),
+                Err(_) => {}
             }
         }
-        Ok(())
     }
 
     /// Returns the text of a reason and its remedy; `None` if a message may still arrive.

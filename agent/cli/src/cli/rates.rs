@@ -252,18 +252,19 @@ impl Measurement<'_> {
                 let topics = open.topics.into_iter();
                 let present: Vec<_> = topics.map(|topic| (topic.topic, topic.types)).collect();
                 if present.is_empty() {
-                    names_of(self.agent, self.domain_id)?;
+                    // A failed hint ends no measurement.
+                    let _ = names_of(self.agent, self.domain_id);
                 }
                 self.rates.opened(&present)
             }
             Line::Sample(sample) => self.sample(&sample, payload)?,
             Line::Clock(clock) => {
                 self.rates.clock(clock.time_ns);
-                self.notes.now()?;
+                self.notes.now();
                 Ok(())
             }
             Line::Missed(missed) => {
-                if is_uncounted(missed.reason, self.sieve.is_some()) {
+                if is_uncounted(missed.known_reason(), self.sieve.is_some()) {
                     self.notes.missed(&missed);
                 }
                 Ok(())
@@ -274,7 +275,7 @@ impl Measurement<'_> {
                 if is_truncated && self.agent.outcome().is_none() {
                     return Ok(Err(End::Refused(Refused(format!("rp: {AGENT_ENDED}")))));
                 }
-                self.notes.end()?;
+                self.notes.end();
                 if is_truncated {
                     // The rest of the capture cannot be read; the error is on stderr.
                     self.code = ExitCode::FAILURE;

@@ -18,7 +18,7 @@ use serde_json::Value;
 use tokio::runtime::Builder;
 use tokio::signal::unix::{SignalKind, signal};
 
-use super::{Output, UserError};
+use super::Output;
 
 /// Maximum number of findings in a manifest, the first ones.
 const MAX_FINDINGS: usize = 1_000;
@@ -37,7 +37,7 @@ no destination, 2 wrong usage, 1 otherwise.
 
 Examples:
   rp ship --once
-  rp ship --status --json | jq .waiting_bags")]
+  sudo rp ship --status --json | jq .waiting_bags")]
 pub(crate) struct Ship {
     /// Configuration file of the agent
     #[arg(long, value_name = "FILE", default_value = DEFAULT_CONFIG)]
@@ -106,11 +106,7 @@ async fn deliver(shipper: &mut Shipper, once: bool) -> Result<Option<Status>, Sh
 }
 
 fn print_status(directory: &Path, is_json: bool) -> Result<ExitCode> {
-    let Some(status) = Status::read(directory) else {
-        let directory = directory.display();
-        let text = format!("rp: no delivery has begun: {directory} has no status.json");
-        return Err(UserError(text).into());
-    };
+    let status = Status::read(directory)?;
     let text = match is_json {
         true => serde_json::to_string_pretty(&status).context("the status")? + "\n",
         false => text(&status),

@@ -57,7 +57,7 @@ impl LineReader {
                 first: SequenceNumber(facts.first_sequence_number),
                 last: SequenceNumber(facts.last_sequence_number),
                 samples: facts.samples,
-                reason: match facts.reason {
+                reason: match facts.known_reason() {
                     samples::MissedReason::Incomplete => MissedReason::Incomplete,
                     samples::MissedReason::Lost => MissedReason::Lost,
                     samples::MissedReason::Unannounced => MissedReason::Unannounced,

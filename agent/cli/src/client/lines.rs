@@ -76,14 +76,20 @@ impl<'a> Lines<'a> {
     ///
     /// Fails as [`Self::line`] does.
     pub fn line_within(&mut self, longest: Duration) -> Result<Next, ClientError> {
-        let agent = self.agent;
+        let (agent, received) = (self.agent, self.buffer.len());
         agent.runtime.block_on(async {
             match timeout(longest, self.next_line()).await {
                 Ok(line) => Ok(line?.map_or(Next::End, Next::Line)),
+                // A part of a line ended the silence.
+                Err(_) if self.buffer.len() > received => Ok(Next::Nothing),
                 Err(_) => {
-                    // The wait counts towards the silence.
+                    // The wait counts towards the silence. A short one ends before `frame` does.
                     self.waited += longest;
-                    Ok(Next::Nothing)
+                    let limit = self.silence.map(|silence| silence + DRAIN_TIMEOUT);
+                    match limit.is_some_and(|limit| self.waited >= limit) {
+                        true => Err(agent.transport.timed_out()),
+                        false => Ok(Next::Nothing),
+                    }
                 }
             }
         })

@@ -10,8 +10,8 @@ use http_body_util::{BodyExt as _, Full, Limited};
 use hyper::header::{AUTHORIZATION, CONTENT_TYPE, HeaderValue, USER_AGENT};
 use hyper::{Request, StatusCode, Uri};
 use hyper_rustls::{HttpsConnector, HttpsConnectorBuilder};
-use hyper_util::client::legacy::Client;
 use hyper_util::client::legacy::connect::HttpConnector;
+use hyper_util::client::legacy::{Client, ResponseFuture};
 use hyper_util::rt::TokioExecutor;
 use percent_encoding::{NON_ALPHANUMERIC, utf8_percent_encode};
 use serde::Deserialize;
@@ -32,8 +32,16 @@ pub(super) type Labels = BTreeMap<String, String>;
 pub struct Engine {
     query: Uri,
     token: Option<HeaderValue>,
-    client: Client<HttpsConnector<HttpConnector>, Full<Bytes>>,
+    client: HttpClient,
     runtime: Runtime,
+}
+
+/// A client with or without encryption. Only the former needs the certificate authorities of this
+/// host, which may have none.
+#[derive(Debug)]
+enum HttpClient {
+    Plain(Client<HttpConnector, Full<Bytes>>),
+    Encrypted(Client<HttpsConnector<HttpConnector>, Full<Bytes>>),
 }
 
 /// A text is not the address of an engine.
@@ -128,17 +136,13 @@ impl Engine {
             let value = HeaderValue::try_from(format!("Bearer {}", token.trim()));
             value.map_err(|_| EngineError::Token)
         });
-        let connector = HttpsConnectorBuilder::new()
-            .with_native_roots()
-            .map_err(EngineError::Prepare)?
-            .https_or_http()
-            .enable_http1()
-            .build();
+        let query = address.query();
+        let client = HttpClient::of(&query).map_err(EngineError::Prepare)?;
         let runtime = Builder::new_current_thread().enable_all().build();
         Ok(Self {
-            query: address.query(),
+            query,
             token: token.transpose()?,
-            client: Client::builder(TokioExecutor::new()).build(connector),
+            client,
             runtime: runtime.map_err(EngineError::Prepare)?,
         })
     }
@@ -179,6 +183,28 @@ impl Engine {
             answered.unwrap_or(Err(EngineError::Slow))
         })?;
         read(&body)
+    }
+}
+
+impl HttpClient {
+    fn of(address: &Uri) -> io::Result<Self> {
+        let builder = Client::builder(TokioExecutor::new());
+        if address.scheme_str() != Some("https") {
+            return Ok(Self::Plain(builder.build(HttpConnector::new())));
+        }
+        let connector = HttpsConnectorBuilder::new()
+            .with_native_roots()?
+            .https_only()
+            .enable_http1()
+            .build();
+        Ok(Self::Encrypted(builder.build(connector)))
+    }
+
+    fn request(&self, request: Request<Full<Bytes>>) -> ResponseFuture {
+        match self {
+            Self::Plain(client) => client.request(request),
+            Self::Encrypted(client) => client.request(request),
+        }
     }
 }
 

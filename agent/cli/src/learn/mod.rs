@@ -40,6 +40,8 @@ pub struct Learner {
     topics: BTreeMap<String, Observation>,
     /// Time of the first and the last view, in Unix seconds.
     period: Option<(f64, f64)>,
+    /// Time of the last view by a clock without steps, in seconds.
+    latest_view: f64,
     /// Whole seconds that were counted.
     seconds: u32,
     /// Topics that a watch cannot name, or that are beyond the limit of watches.
@@ -110,6 +112,7 @@ impl Learner {
             selection,
             topics: BTreeMap::new(),
             period: None,
+            latest_view: 0.0,
             seconds: 0,
             unwatchable: BTreeMap::new(),
         }
@@ -144,11 +147,14 @@ impl Learner {
             .map(String::as_str)
     }
 
-    /// Counts what happened since the last view. A view that follows too early is skipped.
-    pub fn observe(&mut self, list: &TopicList<'_>) {
+    /// Counts what happened since the last view. A view that follows too early is skipped. `at` is
+    /// the time of the view in seconds, by a clock without steps: the robot's clock may be set.
+    pub fn observe(&mut self, list: &TopicList<'_>, at: f64) {
         let now = list.timestamp_seconds;
-        let elapsed = self.period.map_or(0.0, |(_, last)| now - last);
-        if self.period.is_some() && elapsed < MIN_STEP {
+        let elapsed = self.period.map_or(0.0, |_| at - self.latest_view);
+        // A busy agent repeats its last state.
+        let is_known = self.latest() == Some(now);
+        if is_known || (self.period.is_some() && elapsed < MIN_STEP) {
             return;
         }
         let steps = whole_seconds(elapsed.min(MAX_STEP)).min(MAX_SECONDS - self.seconds);
@@ -165,6 +171,7 @@ impl Learner {
         }
         let first = self.period.map_or(now, |(first, _)| first);
         self.period = Some((first, now));
+        self.latest_view = at;
     }
 
     /// Returns the thresholds of each topic. `None` if less than one second was seen.

@@ -10,7 +10,9 @@ use super::*;
 
 /// A robot in virtual time, whose topics have counters of their messages.
 struct Robot {
+    /// Time by the robot's clock, and by a clock without steps.
     now: f64,
+    steady: f64,
     learner: Learner,
     topics: Vec<Topic<'static>>,
 }
@@ -41,6 +43,7 @@ impl Robot {
         };
         let mut robot = Self {
             now: 1000.0,
+            steady: 7.0,
             learner: Learner::new(Selection::default()),
             topics: names.iter().map(topic).collect(),
         };
@@ -49,15 +52,21 @@ impl Robot {
     }
 
     fn view(&mut self) {
-        self.learner.observe(&TopicList {
+        let list = TopicList {
             timestamp_seconds: self.now,
             topics: self.topics.clone(),
-        });
+        };
+        self.learner.observe(&list, self.steady);
+    }
+
+    fn pass(&mut self, seconds: f64) {
+        self.now += seconds;
+        self.steady += seconds;
     }
 
     /// Advances time by one second, in which the first topic has this activity.
     fn second(&mut self, activity: Activity) {
-        self.now += 1.0;
+        self.pass(1.0);
         let counted = self.topics[0].measurement.as_mut().unwrap();
         let before = counted.latency.unwrap_or_default();
         let count = before.count + activity.messages;
@@ -295,18 +304,57 @@ fn views_too_close_or_too_far_apart_count_whole_seconds() {
     let mut robot = Robot::new(&["/imu"]);
     for _ in 0..30 {
         robot.second(STEADY);
-        robot.now += 0.1;
+        robot.pass(0.1);
         robot.view();
-        robot.now -= 0.1;
+        robot.pass(-0.1);
     }
     assert_eq!(robot.learner.seconds(), 30);
     // The agent was busy for three seconds.
-    robot.now += 2.0;
+    robot.pass(2.0);
     robot.second(Activity {
         messages: 30,
         ..STEADY
     });
     assert_eq!(robot.learner.seconds(), 33);
+    assert_eq!(robot.topic_thresholds().values.min_rate_hz, Some(8.0));
+}
+
+#[test]
+fn a_robot_whose_clock_is_set_keeps_its_thresholds() {
+    for step in [3600.0, -3600.0, -0.7] {
+        let mut robot = Robot::new(&["/imu"]);
+        for second in 0..60 {
+            if second == 30 {
+                robot.now += step;
+            }
+            robot.second(STEADY);
+        }
+        assert_eq!(robot.learner.seconds(), 60, "{step}");
+        let values = robot.topic_thresholds().values;
+        assert_eq!(
+            (values.min_rate_hz, values.max_rate_hz, values.publishers),
+            (Some(8.0), Some(12.0), Some(1)),
+            "{step}"
+        );
+    }
+}
+
+#[test]
+fn a_view_of_the_same_state_is_skipped() {
+    let mut robot = Robot::new(&["/imu"]);
+    for _ in 0..30 {
+        robot.second(STEADY);
+    }
+    // The busy agent answers a second later with the same state.
+    robot.steady += 1.0;
+    robot.view();
+    assert_eq!(robot.learner.seconds(), 30);
+    robot.now += 1.0;
+    robot.second(Activity {
+        messages: 20,
+        ..STEADY
+    });
+    assert_eq!(robot.learner.seconds(), 32);
     assert_eq!(robot.topic_thresholds().values.min_rate_hz, Some(8.0));
 }
 

@@ -10,7 +10,8 @@ use hyper::header::{LOCATION, USER_AGENT};
 use hyper::http::uri::InvalidUriParts;
 use hyper::{Request, StatusCode, Uri};
 use hyper_rustls::HttpsConnectorBuilder;
-use hyper_util::client::legacy::Client;
+use hyper_util::client::legacy::connect::HttpConnector;
+use hyper_util::client::legacy::{Client, ResponseFuture};
 use hyper_util::rt::TokioExecutor;
 use tokio::runtime::Builder;
 use tokio::time::timeout;
@@ -67,17 +68,11 @@ pub(super) fn fetch(address: &Uri) -> Result<Vec<u8>, FetchError> {
 }
 
 async fn follow(mut address: Uri) -> Result<Vec<u8>, FetchError> {
-    let connector = HttpsConnectorBuilder::new()
-        .with_native_roots()?
-        .https_or_http()
-        .enable_http1()
-        .build();
-    let client = Client::builder(TokioExecutor::new()).build(connector);
     for _ in 0..=MAX_REDIRECTIONS {
         let request = Request::get(&address)
             .header(USER_AGENT, concat!("rp/", env!("CARGO_PKG_VERSION")))
             .body(Empty::<Bytes>::new())?;
-        let answer = client.request(request).await?;
+        let answer = send(request)?.await?;
         if answer.status().is_redirection() {
             let target = answer.headers().get(LOCATION);
             let target = target.and_then(|value| value.to_str().ok()?.parse::<Uri>().ok());
@@ -91,6 +86,21 @@ async fn follow(mut address: Uri) -> Result<Vec<u8>, FetchError> {
         return Ok(body.map_err(FetchError::Body)?.to_bytes().into());
     }
     Err(FetchError::Redirections)
+}
+
+/// Sends a request. Only an encrypted one needs the certificate authorities of this host, which may
+/// have none.
+fn send(request: Request<Empty<Bytes>>) -> io::Result<ResponseFuture> {
+    let builder = Client::builder(TokioExecutor::new());
+    if request.uri().scheme_str() != Some("https") {
+        return Ok(builder.build(HttpConnector::new()).request(request));
+    }
+    let connector = HttpsConnectorBuilder::new()
+        .with_native_roots()?
+        .https_only()
+        .enable_http1()
+        .build();
+    Ok(builder.build(connector).request(request))
 }
 
 /// Returns the next address. It keeps the host if `target` has none, and never leaves HTTPS.

@@ -280,6 +280,22 @@ fn the_status_of_the_command_is_kept() -> Result<()> {
 }
 
 #[test]
+fn a_bag_that_cannot_be_kept_does_not_lose_the_verdict() -> Result<()> {
+    let host = Namespace::isolated()?;
+    let place = Place::new(&at_the_sockets_of(&host))?;
+    let bag = place.path("out/bag");
+    let script = format!("mkdir {}; exit 0", bag.display());
+    let mut process = place.start(&host, &[], &script)?;
+    let cases = place.end(&mut process, CONDITION_FAILED)?;
+    ensure!(cases.has("observation", "participants"), "{:?}", cases.0);
+    let page = report(&place)?;
+    ensure!(page.contains("not kept: cannot write"), "{page}");
+    let printed = fs::read_to_string(place.path("said"))?;
+    ensure!(printed.contains("cannot write"), "{printed}");
+    Ok(())
+}
+
+#[test]
 fn hostile_names_are_escaped_in_every_artefact() -> Result<()> {
     let link = Link::new()?;
     let place = Place::new(ON_THE_WIRE)?;

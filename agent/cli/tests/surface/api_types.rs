@@ -164,3 +164,15 @@ fn reload(agent: &LocalAgent, file: &Path, text: &str) {
     assert!(problem.kind.ends_with(Code::InvalidConfiguration.as_str()));
     assert_eq!(problem.mistakes.len(), 1, "{problem:?}");
 }
+
+#[test]
+fn a_missed_message_with_a_reason_of_a_newer_agent_is_read_and_kept() {
+    let line = serde_json::json!({"missed": {
+        "topic": "/a", "domain_id": 0, "writer": "01", "samples": 2, "first_sequence_number": 4,
+        "last_sequence_number": 5, "reason": "writer_restarted",
+    }});
+    let samples::Line::Missed(missed) = read_as(&line) else {
+        panic!("{line}");
+    };
+    assert_eq!(missed.known_reason(), samples::MissedReason::NotCaptured);
+}

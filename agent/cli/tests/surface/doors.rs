@@ -347,6 +347,31 @@ fn loopback_grants_the_configured_access_and_the_socket_grants_all() {
 }
 
 #[test]
+fn a_client_without_a_token_learns_that_the_streams_left_are_for_clients_with_one() {
+    let mut agent = LocalAgent::start(&mut rp(), &["--speed", "max"]);
+    agent.wait_for_log("ready");
+    for path in ["/events", "/live"] {
+        let open = || {
+            let mut stream = TcpStream::connect(agent.api).unwrap();
+            stream.set_read_timeout(Some(PATIENCE)).unwrap();
+            let head = format!("GET {path} HTTP/1.1\r\nHost: {}\r\n\r\n", agent.api);
+            stream.write_all(head.as_bytes()).unwrap();
+            let mut answer = [0; 12];
+            stream.read_exact(&mut answer).unwrap();
+            assert_eq!(&answer, b"HTTP/1.1 200", "{path}");
+            stream
+        };
+        let open: Vec<_> = (0..12).map(|_| open()).collect();
+        let answer = request(agent.api, "GET", path, "");
+        let (code, detail) = refusal(&answer).unwrap();
+        assert_eq!((answer.status, code.as_str()), (503, "too-many-streams"));
+        let expected = "4 of 16 are for clients with a token";
+        assert!(detail.ends_with(expected), "{path}: {detail}");
+        drop(open);
+    }
+}
+
+#[test]
 fn by_default_loopback_grants_watches_but_no_payloads() {
     use ros2probe_daemon::config::{Access, Config};
     assert_eq!(Config::default().api.loopback, Access::Watch);
@@ -459,4 +484,43 @@ fn text_of_a_file_is_escaped_before_it_reaches_the_terminal() {
     std::fs::write(cut.join(name), "nothing").unwrap();
     let printed = run(&["bag", "reindex"], &cut);
     assert!(printed.contains("]0;title"), "{printed}");
+}
+
+#[test]
+fn a_refused_request_for_a_hint_does_not_end_an_echo() {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = listener.local_addr().unwrap().to_string();
+    let problem = |code: &str, status: u16| {
+        let body = format!(
+            r#"{{"type":"urn:ros2probe:problem:{code}","status":{status},"detail":"refused"}}"#
+        );
+        let length = body.len();
+        format!("HTTP/1.1 {status} No\r\ncontent-length: {length}\r\n\r\n{body}")
+    };
+    std::thread::spawn(move || {
+        let mut is_known = false;
+        for client in listener.incoming() {
+            let (mut client, mut request) = (client.unwrap(), [0; 4096]);
+            let count = client.read(&mut request).unwrap();
+            let request = String::from_utf8_lossy(&request[..count]);
+            let answer = if request.starts_with("GET /samples?") {
+                let lines =
+                    "{\"open\":{\"topics\":[]}}\n{\"end\":{\"reason\":\"end of capture\"}}\n";
+                let length = lines.len();
+                format!("HTTP/1.1 200 OK\r\ncontent-length: {length}\r\n\r\n{lines}")
+            } else if request.starts_with("GET /topics/a?")
+                && !std::mem::replace(&mut is_known, true)
+            {
+                problem("no-such-topic", 404)
+            } else {
+                problem("too-many-clients", 503)
+            };
+            client.write_all(answer.as_bytes()).unwrap();
+        }
+    });
+    let echo = ["topic", "echo", "/a", "std_msgs/msg/String", "--host"];
+    let output = rp().args(echo).arg(&address).output().unwrap();
+    let printed = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(0), "{printed}");
+    assert!(!printed.contains("refused"), "{printed}");
 }

@@ -69,6 +69,29 @@ fn an_engine_without_a_usable_answer_is_one_error() {
 }
 
 #[test]
+fn an_engine_without_encryption_needs_no_certificate_authorities() {
+    let directory = tempfile::tempdir().unwrap();
+    let authorities = directory.path().join("none.pem");
+    std::fs::write(&authorities, "").unwrap();
+    let page = engine(|out| write!(out, "HTTP/1.1 200 OK\r\nContent-Length: 6\r\n\r\n<html>"));
+    for (url, expected) in [
+        (
+            format!("http://{page}"),
+            "the answer is not one of Prometheus's query API",
+        ),
+        (format!("https://{page}"), "cannot prepare the request"),
+    ] {
+        let mut command = rp();
+        command.env("SSL_CERT_FILE", &authorities);
+        command.env_remove("SSL_CERT_DIR");
+        let output = command.args(["fleet", "--engine", &url]).output().unwrap();
+        let text = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(1), "{text}");
+        assert!(text.contains(expected), "{url}: {text}");
+    }
+}
+
+#[test]
 fn an_answer_beyond_the_cap_is_refused() {
     let endless = engine(|out| {
         write!(out, "HTTP/1.1 200 OK\r\nContent-Length: 9000000000\r\n\r\n")?;

@@ -736,6 +736,48 @@ fn a_deletion_for_space_keeps_to_pauses_and_windows() {
 }
 
 #[test]
+fn a_status_that_cannot_be_read_has_the_reason_and_the_remedy() {
+    use std::os::unix::fs::{MetadataExt as _, PermissionsExt as _};
+    let folder = tempfile::tempdir().unwrap();
+    let robot = Robot::to(&format!("file://{}", folder.path().display()), "");
+    let status = || robot.command(&["--status"]).output().unwrap();
+    let fails = |output: &Output, text: &str| {
+        let printed = String::from_utf8(output.stderr.clone()).unwrap();
+        assert_eq!(output.status.code(), Some(1), "{printed}");
+        assert_eq!(printed.lines().count(), 1, "{printed}");
+        assert!(printed.contains(text), "{printed}");
+    };
+    fails(&status(), "no delivery has begun: ");
+    robot.record("drive", 1000, 100);
+    robot.delivers();
+
+    // The build directory may not be readable for other users.
+    let program = robot.path("rp");
+    fs::copy(env!("CARGO_BIN_EXE_rp"), &program).unwrap();
+    let directory = robot.path("state/ship");
+    for (path, mode) in [
+        (robot.directory.path(), 0o755),
+        (&program, 0o755),
+        (&directory, 0o000),
+    ] {
+        fs::set_permissions(path, fs::Permissions::from_mode(mode)).unwrap();
+    }
+    let mut other = std::process::Command::new("setpriv");
+    if fs::metadata("/proc/self").unwrap().uid() == 0 {
+        other.args(["--reuid=65534", "--regid=65534", "--clear-groups"]);
+    }
+    other.arg("--inh-caps=-all").arg(&program);
+    other.args(["ship", "--status", "--config"]);
+    let denied = other.arg(robot.path("ros2probe.yaml")).output().unwrap();
+    let remedy = "state/ship/status.json: use sudo, or join the group ros2probe";
+    fails(&denied, remedy);
+
+    fs::set_permissions(&directory, fs::Permissions::from_mode(0o750)).unwrap();
+    fs::write(directory.join("status.json"), "").unwrap();
+    fails(&status(), "status.json is damaged");
+}
+
+#[test]
 fn an_idle_service_does_not_write_its_status_again() {
     let folder = tempfile::tempdir().unwrap();
     let robot = Robot::to(&format!("file://{}", folder.path().display()), "");

@@ -177,6 +177,19 @@ fn a_feed_over_https_needs_a_certificate_of_a_known_authority() {
 }
 
 #[test]
+fn a_feed_without_encryption_needs_no_certificate_authorities() {
+    let directory = tempfile::tempdir().unwrap();
+    let authorities = write(directory.path(), "none.pem", "");
+    let address = format!("http://127.0.0.1:{}/latest", serve(answer));
+    let mut rp = rp();
+    rp.env("SSL_CERT_FILE", authorities);
+    rp.env_remove("SSL_CERT_DIR");
+    rp.args(["upgrade", "--check", "--feed", &address]);
+    let output = rp.output().unwrap();
+    assert_eq!(output.status.code(), Some(100), "{output:?}");
+}
+
+#[test]
 fn an_invalid_feed_is_reported_in_one_line() {
     let directory = tempfile::tempdir().unwrap();
     fails(

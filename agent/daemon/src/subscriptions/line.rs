@@ -65,7 +65,8 @@ fn missed(missed: &Missed) -> samples::Missed {
             MissedReason::Unannounced => samples::MissedReason::Unannounced,
             MissedReason::NotCaptured => samples::MissedReason::NotCaptured,
             MissedReason::QueueFull => samples::MissedReason::QueueFull,
-        },
+        }
+        .into(),
     }
 }
 
@@ -175,7 +176,7 @@ mod tests {
                     samples: 2,
                     first_sequence_number: 4,
                     last_sequence_number: 5,
-                    reason: samples::MissedReason::QueueFull,
+                    reason: samples::MissedReason::QueueFull.into(),
                 }),
                 r#"{"missed":{"topic":"/a","domain_id":0,"writer":"01","samples":2,"first_sequence_number":4,"last_sequence_number":5,"reason":"queue_full"}}"#,
             ),

@@ -160,21 +160,22 @@ impl<'a> Object<'a> {
         }
     }
 
-    /// Returns the elements, if the value is iterable.
-    fn elements(&self) -> Option<Vec<Self>> {
-        Some(match self {
-            Self::List(items) => items.clone(),
+    /// Returns the elements, if the value is iterable. An element is up to 30 times as large as its
+    /// bytes, so only one at a time exists.
+    fn elements(&self) -> Option<Box<dyn Iterator<Item = Self> + '_>> {
+        let elements: Box<dyn Iterator<Item = Self> + '_> = match self {
+            Self::List(items) => Box::new(items.iter().cloned()),
             Self::Array(array) => match &array.items {
-                Items::Scalars(scalars) => scalars.iter().map(Self::scalar).collect(),
-                Items::Texts(texts) => texts
-                    .iter()
-                    .map(|text| Self::Text(Cow::Borrowed(text)))
-                    .collect(),
-                Items::Messages(messages) => messages.iter().map(Self::Message).collect(),
+                Items::Scalars(scalars) => Box::new(scalars.iter().map(Self::scalar)),
+                Items::Texts(texts) => {
+                    Box::new(texts.iter().map(|text| Self::Text(Cow::Borrowed(text))))
+                }
+                Items::Messages(messages) => Box::new(messages.iter().map(Self::Message)),
             },
-            Self::Bytes(bytes) => bytes.iter().map(|byte| Self::Int((*byte).into())).collect(),
+            Self::Bytes(bytes) => Box::new(bytes.iter().map(|byte| Self::Int((*byte).into()))),
             _ => return None,
-        })
+        };
+        Some(elements)
     }
 
     fn equals(&self, other: &Self) -> bool {
@@ -186,13 +187,23 @@ impl<'a> Object<'a> {
             _ => match (self.number(), other.number()) {
                 (Some(one), Some(other)) => one.compare(other) == Some(Ordering::Equal),
                 _ => match (self.elements(), other.elements()) {
-                    (Some(one), Some(other)) => {
-                        one.len() == other.len()
-                            && one.iter().zip(&other).all(|(one, other)| one.equals(other))
-                    }
+                    (Some(one), Some(other)) => are_equal(one, other),
                     _ => false,
                 },
             },
+        }
+    }
+}
+
+fn are_equal<'a>(
+    mut one: impl Iterator<Item = Object<'a>>,
+    mut other: impl Iterator<Item = Object<'a>>,
+) -> bool {
+    loop {
+        match (one.next(), other.next()) {
+            (None, None) => return true,
+            (Some(one), Some(other)) if one.equals(&other) => {}
+            _ => return false,
         }
     }
 }
@@ -523,7 +534,7 @@ fn contains(whole: &Object<'_>, part: &Object<'_>) -> Result<bool, Exception> {
                 .any(|window| window == part.as_ref()));
     }
     match whole.elements() {
-        Some(elements) => Ok(elements.iter().any(|element| element.equals(part))),
+        Some(mut elements) => Ok(elements.any(|element| element.equals(part))),
         None => Err(Exception::NotContainer(whole.type_name())),
     }
 }
@@ -531,7 +542,7 @@ fn contains(whole: &Object<'_>, part: &Object<'_>) -> Result<bool, Exception> {
 fn call<'a>(function: Function, arguments: &[Object<'a>]) -> Result<Object<'a>, Exception> {
     let several = matches!(function, Function::Min | Function::Max) && arguments.len() > 1;
     if several {
-        return extreme(function, arguments);
+        return extreme(function, arguments.iter().cloned());
     }
     let [argument] = arguments else {
         return Err(Exception::ArgumentCount(arguments.len()));
@@ -560,9 +571,9 @@ fn call<'a>(function: Function, arguments: &[Object<'a>]) -> Result<Object<'a>, 
             None => return Err(Exception::BadOperand("abs()", kind())),
         },
         Function::Bool => Object::Bool(argument.is_true()),
-        Function::All => Object::Bool(elements()?.iter().all(Object::is_true)),
-        Function::Any => Object::Bool(elements()?.iter().any(Object::is_true)),
-        Function::Min | Function::Max => extreme(function, &elements()?)?,
+        Function::All => Object::Bool(elements()?.all(|element| element.is_true())),
+        Function::Any => Object::Bool(elements()?.any(|element| element.is_true())),
+        Function::Min | Function::Max => extreme(function, elements()?)?,
         Function::Sum => {
             let mut total = Object::Int(0);
             for element in elements()? {
@@ -615,19 +626,22 @@ fn integer<'a>(object: &Object<'a>) -> Result<Object<'a>, Exception> {
     }))
 }
 
-fn extreme<'a>(function: Function, objects: &[Object<'a>]) -> Result<Object<'a>, Exception> {
+fn extreme<'a>(
+    function: Function,
+    mut objects: impl Iterator<Item = Object<'a>>,
+) -> Result<Object<'a>, Exception> {
     let comparison = if function == Function::Min {
         Comparison::Less
     } else {
         Comparison::Greater
     };
-    let (mut best, rest) = objects.split_first().ok_or(Exception::EmptyArgument)?;
-    for object in rest {
-        if compare(comparison, object, best)? {
+    let mut best = objects.next().ok_or(Exception::EmptyArgument)?;
+    for object in objects {
+        if compare(comparison, &object, &best)? {
             best = object;
         }
     }
-    Ok(best.clone())
+    Ok(best)
 }
 
 fn method<'a>(

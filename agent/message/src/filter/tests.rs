@@ -106,6 +106,31 @@ fn expressions_evaluate_as_in_python() {
 }
 
 #[test]
+fn a_large_array_is_iterable() {
+    const COUNT: u32 = 300_000;
+    let schema = "uint8[] data\nuint8[] same\nuint8[] short";
+    let message_type = MessageType::parse(&"a/msg/C".parse().unwrap(), schema).unwrap();
+    let mut payload = vec![0, 1, 0, 0];
+    for count in [COUNT, COUNT, COUNT - 4] {
+        payload.extend(count.to_le_bytes());
+        payload.extend((0..count).map(|number| 1 + (number % 250) as u8));
+    }
+    let decoded = decode(&message_type, &payload, &Limits::default()).unwrap();
+    for (text, value) in [
+        ("sum(m.data) == 37650000", true),
+        ("min(m.data) == 1 and max(m.data) == 250", true),
+        ("251 in m.data or 0 in m.data", false),
+        ("all(m.data) and any(m.data) and 250 in m.data", true),
+        ("m.data == m.same and m.data != m.short", true),
+        ("m.short == m.data", false),
+    ] {
+        let filter = Filter::parse(text).unwrap();
+        let passes = filter.passes(Subject::Message(&decoded.message));
+        assert_eq!(passes, Ok(value), "{text}");
+    }
+}
+
+#[test]
 fn a_mistake_is_reported_with_its_column() {
     for (text, error) in [
         ("m.x = 3", "column 5: `=` assigns; `==` compares"),

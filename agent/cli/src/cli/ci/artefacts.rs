@@ -51,26 +51,22 @@ impl Artefacts {
     }
 
     /// Copies the bag in `recording`, if there is one. Returns `content` with the place of the bag.
+    ///
+    /// # Errors
+    ///
+    /// Fails if a file cannot be copied. The copy is then removed, because the reports need space.
     pub(super) fn keep_bag(&self, recording: &Path, content: String) -> Result<String> {
+        if !recording.is_dir() {
+            return Ok(content);
+        }
         let bag = self.directory.join(BAG_NAME);
-        let copy = || -> io::Result<bool> {
-            if !recording.is_dir() {
-                return Ok(false);
-            }
-            fs::create_dir(&bag)?;
-            for file in fs::read_dir(recording)? {
-                let file = file?;
-                // The permissions are those of the other files, not those of the agent.
-                let mut copy = File::create_new(bag.join(file.file_name()))?;
-                io::copy(&mut File::open(file.path())?, &mut copy)?;
-            }
-            Ok(true)
-        };
-        let is_kept = copy().with_context(|| format!("cannot write {}", bag.display()))?;
-        Ok(match is_kept {
-            true => format!("{BAG_NAME}/: {content}"),
-            false => content,
-        })
+        let unwritable = || format!("cannot write {}", bag.display());
+        fs::create_dir(&bag).with_context(unwritable)?;
+        if let Err(error) = copy_files(recording, &bag) {
+            let _ = self.remove_bag();
+            return Err(error).with_context(unwritable);
+        }
+        Ok(format!("{BAG_NAME}/: {content}"))
     }
 
     /// Writes the reports.
@@ -114,5 +110,36 @@ impl Artefacts {
                 Err(UserError(text).into())
             }
         }
+    }
+}
+
+fn copy_files(from: &Path, to: &Path) -> io::Result<()> {
+    for file in fs::read_dir(from)? {
+        let file = file?;
+        // The permissions are those of the other files, not those of the agent.
+        let mut copy = File::create_new(to.join(file.file_name()))?;
+        io::copy(&mut File::open(file.path())?, &mut copy)?;
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_bag_that_cannot_be_copied_leaves_no_files() {
+        let root = tempfile::tempdir().unwrap();
+        let (output, recording) = (root.path().join("output"), root.path().join("recording"));
+        let artefacts = Artefacts::create(&output).unwrap();
+        fs::create_dir(&recording).unwrap();
+        fs::write(recording.join("bag_0.mcap"), "messages").unwrap();
+        let kept = || artefacts.keep_bag(&recording, "1 message".to_owned());
+        assert_eq!(kept().unwrap(), "bag/: 1 message");
+        artefacts.remove_bag().unwrap();
+        // Reading a directory fails after its copy was created.
+        fs::create_dir(recording.join("bag_1.mcap")).unwrap();
+        assert!(kept().is_err());
+        assert!(!output.join(BAG_NAME).exists());
     }
 }

@@ -2,35 +2,63 @@
 
 use std::io::{self, IsTerminal as _, Read as _};
 use std::sync::mpsc::Sender;
+use std::sync::{Mutex, PoisonError};
 
 use ros2probe_daemon::recording::Command;
-use rustix::termios::{LocalModes, OptionalActions, Termios, tcgetattr, tcsetattr};
+use rustix::process::getpgrp;
+use rustix::termios::{LocalModes, OptionalActions, Termios, tcgetattr, tcgetpgrp, tcsetattr};
 
 const SPACE_KEY: u8 = b' ';
 
+/// Settings of the terminal before [`Keys::take`]. The variable is global, because a signal may end
+/// the process.
+static SETTINGS_BEFORE: Mutex<Option<Termios>> = Mutex::new(None);
+
 /// Standard input without line mode and echo. Dropping it restores the settings.
-pub(super) struct Keys(Termios);
+pub(super) struct Keys(());
 
 impl Keys {
+    /// Returns `None` if standard input is no terminal, or the terminal of another process group.
     pub(super) fn take() -> Option<Self> {
         let stdin = io::stdin();
-        if !stdin.is_terminal() {
+        // A change of the settings would stop a process in the background.
+        if !stdin.is_terminal() || !is_in_foreground() {
             return None;
         }
         let before = tcgetattr(&stdin).ok()?;
         let mut now = before.clone();
         now.local_modes
             .remove(LocalModes::ICANON | LocalModes::ECHO);
+        *SETTINGS_BEFORE
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner) = Some(before);
         tcsetattr(&stdin, OptionalActions::Now, &now).ok()?;
-        Some(Self(before))
+        Some(Self(()))
     }
 }
 
 impl Drop for Keys {
     fn drop(&mut self) {
-        // A failure here cannot be reported.
-        let _ = tcsetattr(io::stdin(), OptionalActions::Now, &self.0);
+        give_back();
     }
+}
+
+/// Restores the settings of the terminal, if they were changed.
+pub(super) fn give_back() {
+    let mut before = SETTINGS_BEFORE
+        .lock()
+        .unwrap_or_else(PoisonError::into_inner);
+    if let Some(before) = before.take()
+        && is_in_foreground()
+    {
+        // A failure here cannot be reported.
+        let _ = tcsetattr(io::stdin(), OptionalActions::Now, &before);
+    }
+}
+
+/// Returns whether the terminal at standard input belongs to the process group.
+fn is_in_foreground() -> bool {
+    tcgetpgrp(io::stdin()) == Ok(getpgrp())
 }
 
 pub(super) fn read_keys(give: Sender<Command>) {

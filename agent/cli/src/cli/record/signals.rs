@@ -9,6 +9,7 @@ use ros2probe_daemon::recording::Command;
 use tokio::signal::unix::{SignalKind, signal};
 
 use super::super::interrupt::EXIT_INTERRUPTED;
+use super::keys::give_back;
 use super::output::log;
 
 /// Phase of a recording, shared with the signal thread.
@@ -86,6 +87,7 @@ pub(super) fn listen(give: Sender<Command>, phase: Phase) -> io::Result<()> {
                 _ => {
                     let text = "Interrupted; `rp bag reindex` completes the bag";
                     log("ERROR", text);
+                    give_back();
                     std::process::exit(EXIT_INTERRUPTED.into());
                 }
             };

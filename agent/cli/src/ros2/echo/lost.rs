@@ -13,7 +13,7 @@ impl Lost {
     /// Records messages that will not arrive. Returns ros2cli's text, or nothing if the messages
     /// were on the wire. As in ros2cli, no line break precedes `---`.
     pub fn missed(&mut self, missed: &Missed) -> String {
-        match missed.reason {
+        match missed.known_reason() {
             MissedReason::Incomplete | MissedReason::Lost => {}
             // These messages were on the wire.
             MissedReason::Unannounced | MissedReason::NotCaptured | MissedReason::QueueFull => {
@@ -30,6 +30,8 @@ impl Lost {
 
 #[cfg(test)]
 mod tests {
+    use ros2probe_api::Open;
+
     use super::*;
 
     fn missed(first: u64, last: u64, reason: MissedReason) -> Missed {
@@ -40,7 +42,7 @@ mod tests {
             samples: last - first + 1,
             first_sequence_number: first,
             last_sequence_number: last,
-            reason,
+            reason: reason.into(),
         }
     }
 
@@ -51,6 +53,9 @@ mod tests {
         assert_eq!(lost.missed(&missed(2, 3, MissedReason::Lost)), text);
         assert_eq!(lost.missed(&missed(4, 4, MissedReason::QueueFull)), "");
         assert_eq!(lost.missed(&missed(5, 5, MissedReason::NotCaptured)), "");
+        let mut unknown = missed(5, 5, MissedReason::Lost);
+        unknown.reason = Open::Unknown("reset".to_owned());
+        assert_eq!(lost.missed(&unknown), "");
         let text = "A message was lost!!!\n\ttotal count change:1\n\ttotal count: 3---\n";
         assert_eq!(lost.missed(&missed(6, 6, MissedReason::Incomplete)), text);
     }

@@ -1,5 +1,9 @@
 //! The start and the interruption of a recording of many topics.
 
+use std::io::{Read as _, Write as _};
+
+use ros2probe_testing::pseudo_terminal::Terminal;
+
 use super::*;
 
 #[test]
@@ -76,4 +80,94 @@ fn a_second_interrupt_ends_a_recording_without_waiting_but_with_its_report() {
         "{:#?}",
         recording.printed
     );
+}
+
+/// Serves recordings at a socket: each stream has its first line, and no other request has an
+/// answer. `held` is the path whose connections stay open, as those of streams do.
+fn serve_silent_streams(listener: UnixListener, held: Option<&'static str>) {
+    std::thread::spawn(move || {
+        let mut open = Vec::new();
+        for client in listener.incoming() {
+            let (mut client, mut request) = (client.unwrap(), [0; 4096]);
+            let count = client.read(&mut request).unwrap_or(0);
+            let request = String::from_utf8_lossy(&request[..count]);
+            if request.starts_with("GET /samples?") {
+                let head = "HTTP/1.1 200 OK\r\ntransfer-encoding: chunked\r\n\r\n";
+                let line = "{\"open\":{\"topics\":[]}}\n";
+                write!(client, "{head}{:x}\r\n{line}\r\n", line.len()).unwrap();
+                open.push(client);
+            } else if held.is_some_and(|path| request.starts_with(&format!("GET {path} "))) {
+                open.push(client);
+            }
+        }
+    });
+}
+
+/// Returns `rp bag record -a` of the agent at a socket.
+fn record_at(socket: &Path, bag: &Path) -> Command {
+    let mut command = rp();
+    command.env_remove("ROS_DISTRO").env_remove("ROS_DOMAIN_ID");
+    command.args(["bag", "record", "-a", "--socket"]);
+    command.arg(socket).arg("-o").arg(bag);
+    command
+}
+
+#[test]
+fn a_recording_of_an_agent_that_falls_silent_ends_with_an_error() {
+    let directory = tempfile::tempdir().unwrap();
+    let socket = directory.path().join("api.sock");
+    let bag = directory.path().join("bag");
+    serve_silent_streams(UnixListener::bind(&socket).unwrap(), None);
+    let mut recording = Recording::of(&mut record_at(&socket, &bag));
+    recording.wait_for("Recording...");
+    let (status, ended) = recording.end();
+    assert_eq!(status.code(), Some(1), "{:#?}", recording.printed);
+    assert!((4.0..12.0).contains(&ended.as_secs_f64()), "{ended:?}");
+    let last = recording.printed.last().unwrap();
+    assert!(last.contains("does not answer"), "{:#?}", recording.printed);
+    assert!(bag.join("metadata.yaml").exists());
+}
+
+#[test]
+fn a_recording_in_the_background_of_a_shell_is_not_stopped() {
+    let directory = tempfile::tempdir().unwrap();
+    let socket = directory.path().join("api.sock");
+    serve_silent_streams(UnixListener::bind(&socket).unwrap(), None);
+    let record = record_at(&socket, &directory.path().join("bag"));
+    let mut shell = Command::new("bash");
+    shell.env_remove("ROS_DISTRO").env_remove("ROS_DOMAIN_ID");
+    // With job control, the recording has a process group of its own.
+    let script = r#"set -m; "$@" & wait $!"#;
+    shell.args(["-c", script, "bash"]);
+    shell.arg(record.get_program()).args(record.get_args());
+    let mut terminal = Terminal::start(&mut shell);
+    terminal.wait_for("Keyboard handling disabled");
+    terminal.wait_for("Recording...");
+    // It ends because the agent is silent.
+    assert_eq!(terminal.ends(), Some(1), "{}", terminal.written());
+    let written = terminal.written();
+    assert!(written.contains("does not answer"), "{written}");
+    terminal.assert_settings_given_back();
+}
+
+#[test]
+fn a_third_interrupt_restores_the_terminal() {
+    let directory = tempfile::tempdir().unwrap();
+    let socket = directory.path().join("api.sock");
+    // The recording waits for an answer, so it cannot end in order.
+    let listener = UnixListener::bind(&socket).unwrap();
+    serve_silent_streams(listener, Some("/participants"));
+    let bag = directory.path().join("bag");
+    let mut terminal = Terminal::start(&mut record_at(&socket, &bag));
+    terminal.wait_for("Press SPACE");
+    terminal.wait_for("Recording...");
+    for _ in 0..3 {
+        // Signals of the same kind that arrive together count as one.
+        std::thread::sleep(Duration::from_millis(100));
+        terminal.signal("-INT");
+    }
+    assert_eq!(terminal.ends(), Some(2), "{}", terminal.written());
+    let written = terminal.written();
+    assert!(written.contains("rp bag reindex"), "{written}");
+    terminal.assert_settings_given_back();
 }
