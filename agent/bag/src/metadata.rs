@@ -78,8 +78,8 @@ pub struct Topic {
     pub type_name: String,
     /// Serialization: `cdr`.
     pub serialization_format: String,
-    /// QoS of the publishers, as `super::qos::profiles` formats it; empty if read from version 9,
-    /// where it is a YAML list.
+    /// QoS of the publishers, as `super::qos::profiles` formats it. Version 9 stores a YAML list,
+    /// which is read as the same text; without publishers the text is empty.
     pub offered_qos_profiles: String,
     /// Type hash: `RIHS01_...` or empty.
     pub type_description_hash: String,
@@ -292,6 +292,8 @@ fn scalar(text: &str) -> String {
 
 /// The structure of the file, key by key.
 mod shape {
+    use serde_yaml::Value;
+
     use super::{BTreeMap, Deserialize};
 
     #[derive(Deserialize)]
@@ -343,7 +345,7 @@ mod shape {
         type_name: String,
         serialization_format: String,
         #[serde(default)]
-        offered_qos_profiles: Option<serde_yaml::Value>,
+        offered_qos_profiles: Option<Value>,
         #[serde(default)]
         type_description_hash: Option<String>,
     }
@@ -382,17 +384,28 @@ mod shape {
 
     fn topic(from: Topic) -> super::Topic {
         let metadata = from.topic_metadata;
-        let profiles = metadata.offered_qos_profiles.as_ref();
         super::Topic {
             name: metadata.name,
             type_name: metadata.type_name,
             serialization_format: metadata.serialization_format,
-            offered_qos_profiles: profiles
-                .and_then(|profiles| profiles.as_str())
-                .unwrap_or_default()
-                .to_owned(),
+            offered_qos_profiles: metadata
+                .offered_qos_profiles
+                .map(profiles)
+                .unwrap_or_default(),
             type_description_hash: metadata.type_description_hash.unwrap_or_default(),
             message_count: from.message_count,
+        }
+    }
+
+    /// Returns the text of the profiles: before version 9 a string, since then a list.
+    fn profiles(from: Value) -> String {
+        match from {
+            Value::String(text) => text,
+            Value::Sequence(list) if !list.is_empty() => {
+                let text = serde_yaml::to_string(&list).unwrap_or_default();
+                text.trim_end().to_owned()
+            }
+            _ => String::new(),
         }
     }
 
@@ -478,9 +491,19 @@ mod tests {
   custom_data: ~
   ros_distro: jazzy";
         assert_eq!(metadata(9).file_text(), text);
-        let read = Metadata::read(text).unwrap();
-        assert_eq!(read.topics[0].name, "/chatter");
-        assert_eq!((read.version, read.files), (9, metadata(9).files));
+        assert_eq!(Metadata::read(text).unwrap(), metadata(9));
+        let without = text.replace(
+            "
+          - history: unknown
+            depth: 0
+            deadline:
+              sec: 1",
+            " []",
+        );
+        let mut expected = metadata(9);
+        expected.topics[0].offered_qos_profiles.clear();
+        assert_eq!(expected.file_text(), without);
+        assert_eq!(Metadata::read(&without).unwrap(), expected);
     }
 
     #[test]

@@ -446,7 +446,9 @@ fn with_overrides(configured: &Config, options: &Options) -> Config {
         private.restrict(&mut config);
     }
     if options.replay.is_some() && options.config.is_none() {
-        // The receivers in the configuration of the installed agent are for the robot's present.
+        // The receivers and snapshots of the installed agent are for the robot's present. Events of
+        // the past would write bags among those of the robot, and remove older ones.
+        config.recordings.snapshots.clear();
         config.remote_write.url = None;
         if let Endpoint::At(_) = config.otlp.endpoint {
             config.otlp.endpoint = Endpoint::Environment;
@@ -729,6 +731,48 @@ fn announce(identity: Identity) {
         Identity::Own => tracing::info!("switched from root to user ros2probe"),
         Identity::Root(reason) => {
             tracing::info!("running as root with capabilities dropped ({reason})");
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_replay_has_receivers_and_snapshots_only_of_a_configuration_for_it() {
+        let configured = Config::parse(
+            b"remote_write: {url: 'http://prometheus:9090/api/v1/write'}\n\
+              otlp: {endpoint: 'http://collector:4317'}\n\
+              recordings: {snapshots: [{name: incident, topics: [/a]}]}\n",
+        )
+        .unwrap();
+        for (config, replay, is_applied) in [
+            (None, Some("drive.pcap"), false),
+            (Some("replay.yaml"), Some("drive.pcap"), true),
+            (None, None, true),
+        ] {
+            let options = Options {
+                config: config.map(PathBuf::from),
+                replay: replay.map(PathBuf::from),
+                speed: None,
+                expansion: Expansion::Limited,
+                report: false,
+                watch: Vec::new(),
+                metrics: None,
+                api: None,
+                foxglove: None,
+                api_loopback: None,
+                private: None,
+                doctor: Doctor::new(|_| unreachable!()),
+            };
+            let config = with_overrides(&configured, &options);
+            let is_in_force = [
+                !config.recordings.snapshots.is_empty(),
+                config.remote_write.url.is_some(),
+                matches!(config.otlp.endpoint, Endpoint::At(_)),
+            ];
+            assert_eq!(is_in_force, [is_applied; 3], "{options:?}");
         }
     }
 }

@@ -86,9 +86,13 @@ impl SettingsCell {
         });
     }
 
-    /// Applies the settings of a successful reload.
-    pub fn reloaded(&self, settings: Settings) {
-        self.settings.store(Arc::new(settings));
+    /// Applies the settings of a successful reload. The watches in force stay: [`Self::watch`]
+    /// already has those of the reload, and a client may add one at the same time.
+    pub fn reloaded(&self, settings: &Settings) {
+        self.settings.rcu(|before| Settings {
+            watches: before.watches.clone(),
+            ..settings.clone()
+        });
         let reload = Reload {
             successful: true,
             last_success: SystemTime::now(),
@@ -122,5 +126,21 @@ mod tests {
         assert_eq!(*cell.settings(), settings);
         assert!(!cell.reload().successful);
         assert_eq!(cell.reload().last_success, first);
+    }
+
+    #[test]
+    fn a_reload_keeps_a_watch_that_was_added_at_the_same_time() {
+        let cell = SettingsCell::new(Settings::default());
+        // The reload has read the watches in force when a client adds one.
+        let reloaded = Settings {
+            histograms: true,
+            ..Settings::clone(&cell.settings())
+        };
+        let added = Arc::new(Watch::named("/added").unwrap());
+        cell.watch(&[Arc::clone(&added)]);
+        cell.reloaded(&reloaded);
+        let settings = cell.settings();
+        assert!(settings.histograms);
+        assert_eq!(settings.watches, [added]);
     }
 }

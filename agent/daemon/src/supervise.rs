@@ -253,11 +253,9 @@ impl Supervisor {
         }
         self.log.set(config.log);
         let in_force = self.watches.active();
-        let shown = in_force.watchlist().watches().to_vec();
-        let watches = shown.len();
+        let watches = in_force.watchlist().watches().len();
         self.sources.events.record(AgentEvent::Reloaded { watches });
-        self.sources.settings.reloaded(Settings {
-            watches: shown,
+        self.sources.settings.reloaded(&Settings {
             // The caps of the start stay in force.
             limits: *self.sources.limits.caps(),
             ..Settings::new(config)

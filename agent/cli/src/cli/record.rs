@@ -9,6 +9,7 @@ mod shortfalls;
 mod signals;
 
 use std::collections::BTreeMap;
+use std::io::{self, IsTerminal as _};
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::mpsc::channel;
@@ -222,10 +223,7 @@ impl Record {
         let mut output = RecordingOutput::new(live);
         output.sampled(&recorder, &locked(&graph_cache).graph);
         let opened = samples.opened().topics.iter();
-        recorder.declare(opened.filter_map(|topic| {
-            let message_type = topic.types.first()?;
-            Some((topic.topic.as_str(), message_type.as_str()))
-        }))?;
+        recorder.declare(opened.map(|topic| (topic.topic.as_str(), topic.types.as_slice())))?;
         let keys = if self.is_batch { None } else { Keys::take() };
         match &keys {
             Some(_) => {
@@ -233,6 +231,9 @@ impl Record {
                 read_keys(give);
             }
             None if self.is_batch => {}
+            None if io::stdin().is_terminal() => {
+                eprintln!("rp runs in the background. Keyboard handling disabled.");
+            }
             None => eprintln!("stdin is not a terminal device. Keyboard handling disabled."),
         }
         log("INFO", "Listening for topics...");

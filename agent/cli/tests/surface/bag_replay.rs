@@ -1,11 +1,16 @@
 //! Bags as a source: every command that reads a capture reads a bag, and prints the same of it.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use ros2probe_bag::{Form, Options, TopicDescription, Writer};
 use ros2probe_testing::local_agent::{LocalAgent, call_api};
 use ros2probe_testing::repository;
+use ros2probe_wire::Timestamp;
+use ros2probe_wire::discovery::Role;
+use ros2probe_wire::qos::{Durability, History, HistoryKind, Qos, Reliability};
+use ros2probe_wire::rtps::VendorId;
 use serde_json::json;
 
 use crate::bag_chains::{CAPTURE, converted, recorded, sqlite3};
@@ -115,6 +120,51 @@ fn topics_of_a_bag_are_published_by_the_player_with_the_recorded_qos() {
         of(&file, &["topic", "info", "-v", "/robot1/imu/data"]),
         info
     );
+}
+
+/// Since Jazzy, metadata.yaml has the QoS as a list. It was read as the default QoS.
+#[test]
+fn a_bag_of_jazzy_is_replayed_with_the_recorded_qos() {
+    let directory = tempfile::tempdir().unwrap();
+    let bag = directory.path().join("jazzy");
+    let options = Options {
+        form: Form::of("jazzy"),
+        ros_distro: "jazzy".to_owned(),
+        ..Options::default()
+    };
+    let mut writer = Writer::create(&bag, options).unwrap();
+    let history = History {
+        kind: HistoryKind::KEEP_LAST,
+        depth: 5,
+    };
+    let publisher = Qos {
+        reliability: Reliability::BEST_EFFORT,
+        durability: Durability::TRANSIENT_LOCAL,
+        history: Some(history),
+        ..Qos::defaults(Role::Writer, VendorId::CYCLONE)
+    };
+    let topic = TopicDescription {
+        name: "/map".to_owned(),
+        type_name: "std_msgs/msg/String".to_owned(),
+        type_hash: None,
+        publishers: vec![publisher],
+        schema: None,
+    };
+    let topic = writer.topic(topic).unwrap();
+    let time = Timestamp(1_795_142_331_000_000_000);
+    let message = b"\0\x01\0\0\x06\0\0\0hello\0";
+    writer.write(topic, time, time, 1, message).unwrap();
+    writer.close(BTreeMap::new()).unwrap();
+    let text = fs::read_to_string(bag.join("metadata.yaml")).unwrap();
+    assert!(text.contains("version: 9"), "{text}");
+    let info = of(&bag, &["topic", "info", "-v", "/map"]);
+    for line in [
+        "  Reliability: BEST_EFFORT",
+        "  History (Depth): KEEP_LAST (5)",
+        "  Durability: TRANSIENT_LOCAL",
+    ] {
+        assert!(info.contains(line), "{line}: {info}");
+    }
 }
 
 #[test]

@@ -93,6 +93,12 @@ enum TopicDecision {
     Excluded,
     /// The filter selects the topic, but the recording has reached a cap.
     NoRoom,
+    /// A loss precedes the first message, and the topic has several types or none. The type of the
+    /// first message counts.
+    Untyped {
+        /// Whether the filter selects the topic by what is known.
+        is_selected: bool,
+    },
 }
 
 struct RecordedTopic {
@@ -184,9 +190,11 @@ impl<'a> Recorder<'a> {
     /// Fails if the storage fails.
     pub fn snapshot(&mut self) -> Result<(), Error> {
         let waiting: Vec<_> = self.ring.iter_mut().flat_map(SampleRing::drain).collect();
-        for sample in waiting {
-            self.write(&sample)?;
-        }
+        // A pause concerns the messages during it, which are not in memory.
+        let paused = std::mem::replace(&mut self.paused, false);
+        let written = waiting.iter().try_for_each(|sample| self.write(sample));
+        self.paused = paused;
+        written?;
         self.writer.flush()
     }
 
@@ -291,17 +299,22 @@ impl<'a> Recorder<'a> {
         self.writer.compressed(done)
     }
 
-    /// Adds topics to the bag by name and type, even if no message follows.
+    /// Adds topics to the bag by name and types, even if no message follows. A topic of several
+    /// types is left to its first message: a subscriber may have announced another type than the
+    /// publishers.
     ///
     /// # Errors
     ///
     /// Fails if the storage fails.
-    pub fn declare<'t>(
+    pub fn declare<'t, T: AsRef<str> + 't>(
         &mut self,
-        topics: impl IntoIterator<Item = (&'t str, &'t str)>,
+        topics: impl IntoIterator<Item = (&'t str, &'t [T])>,
     ) -> Result<(), Error> {
-        let mut topics: Vec<(&str, &str)> = topics.into_iter().collect();
-        topics.retain(|(name, _)| !self.topics.contains_key(*name));
+        let topics = topics.into_iter().filter_map(|(name, types)| match types {
+            [only] if !self.topics.contains_key(name) => Some((name, only.as_ref())),
+            _ => None,
+        });
+        let topics: Vec<(&str, &str)> = topics.collect();
         let names: Vec<String> = topics.iter().map(|(name, _)| (*name).to_owned()).collect();
         let announced = self.discover(&names);
         for ((name, message_type), announced) in topics.into_iter().zip(announced) {
@@ -458,12 +471,21 @@ impl<'a> Recorder<'a> {
                 _ => self.discover_one(name),
             };
             let place = self.decide(name, message_type, offered, &announced, true)?;
-            if matches!(place, TopicDecision::NoRoom) {
-                self.report.missing += messages;
-                self.report.no_room += messages;
-                return Ok(None);
+            match place {
+                TopicDecision::NoRoom => {
+                    self.report.missing += messages;
+                    self.report.no_room += messages;
+                    return Ok(None);
+                }
+                TopicDecision::Untyped { is_selected } => {
+                    if is_selected {
+                        self.report.missing += messages;
+                        self.report.missing_runs_unnamed += 1;
+                    }
+                    return Ok(None);
+                }
+                place => self.store_decision(name, place),
             }
-            self.store_decision(name, place);
         }
         let Some(TopicDecision::Recorded(taken)) = self.topics.get_mut(&**name) else {
             return Ok(None);
@@ -488,7 +510,9 @@ impl<'a> Recorder<'a> {
     fn store_decision(&mut self, name: &str, place: TopicDecision) {
         let bytes = match &place {
             TopicDecision::Recorded(taken) => name.len() + taken.description.type_name.len(),
-            TopicDecision::Excluded | TopicDecision::NoRoom => name.len(),
+            TopicDecision::Excluded | TopicDecision::NoRoom | TopicDecision::Untyped { .. } => {
+                name.len()
+            }
         };
         let is_half_full = self.topics.len() >= RecordedTopics::CAP / 2
             || self.names.remaining() < RecordedNames::CAP / 2;
@@ -524,19 +548,26 @@ impl<'a> Recorder<'a> {
         announced: &DiscoveredTopic,
         came: bool,
     ) -> Result<TopicDecision, Error> {
-        let known = announced
-            .message_types
-            .first()
-            .filter(|_| message_type.is_empty());
-        let message_type = known.map_or(message_type, String::as_str);
+        let message_type = match announced.message_types.as_slice() {
+            [known] if message_type.is_empty() => known.as_str(),
+            _ => message_type,
+        };
+        let is_untyped = message_type.is_empty() && offered.is_none();
         let types = [message_type.to_owned()];
         let candidate = Candidate {
             name,
-            types: &types,
+            types: match is_untyped {
+                true => &announced.message_types,
+                false => &types,
+            },
             published: came || !announced.publishers.is_empty(),
             subscribed: announced.subscribed,
         };
-        if !self.filter.is_selected(&candidate) {
+        let is_selected = self.filter.is_selected(&candidate);
+        if is_untyped {
+            return Ok(TopicDecision::Untyped { is_selected });
+        }
+        if !is_selected {
             return Ok(TopicDecision::Excluded);
         }
         if self.topics.is_full() {

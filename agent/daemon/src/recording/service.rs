@@ -7,7 +7,7 @@ use std::sync::atomic::Ordering;
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
-use std::time::{Duration, SystemTime};
+use std::time::{Duration, Instant, SystemTime};
 
 use jiff::Zoned;
 use tokio::sync::Notify;
@@ -38,6 +38,11 @@ const MAX_ENDED: usize = 16;
 /// Maximum sizes of a bag's chunk and of a file's index in memory, in bytes.
 const CHUNK_BYTES: u64 = 1 << 20;
 const INDEX_BYTES: u64 = 1 << 20;
+/// Maximum time in which recordings complete their bags at the end of the agent. A service manager
+/// kills an agent that takes much longer, for example to compress whole files.
+const FINISH_TIMEOUT: Duration = session::DRAIN_TIMEOUT.saturating_add(Duration::from_secs(1));
+/// Interval at which the end of the agent checks whether the bags are complete.
+const FINISH_POLL: Duration = Duration::from_millis(20);
 /// Maximum length of the name of a recording, in bytes.
 const MAX_NAME: usize = 128;
 
@@ -289,10 +294,7 @@ impl Recordings {
             topic.domain_id == DomainId(domain_id) && selection.covers(&Candidate::from(*topic))
         });
         let covered = covered.take(self.caps.caps().topics);
-        recorder.declare(covered.filter_map(|topic| {
-            let message_type = topic.message_types.first()?;
-            Some((topic.name.as_str(), message_type.as_str()))
-        }))
+        recorder.declare(covered.map(|topic| (topic.name.as_str(), topic.message_types.as_slice())))
     }
 
     /// Starts the thread of a recording. Removes the empty bag on failure.
@@ -335,13 +337,27 @@ impl Recordings {
         self.list().iter().rfind(|each| each.name == name).cloned()
     }
 
-    /// Completes all bags at the end of the agent.
+    /// Completes all bags at the end of the agent. Whole files that are not compressed within some
+    /// seconds stay uncompressed.
     pub fn finish(&self) {
+        self.finish_within(FINISH_TIMEOUT);
+    }
+
+    fn finish_within(&self, timeout: Duration) {
+        let deadline = Instant::now() + timeout;
         // A recording that begins at this moment is completed as well.
         drop(locked(&self.beginning));
         let list = self.all();
         for recording in &list {
             recording.command(Command::Stop);
+        }
+        while !list.iter().all(|recording| recording.has_thread_ended())
+            && Instant::now() < deadline
+        {
+            std::thread::sleep(FINISH_POLL);
+        }
+        for recording in &list {
+            recording.command(Command::Abort);
         }
         for recording in list {
             let thread = locked(&recording.thread).take();
@@ -478,6 +494,11 @@ impl Recording {
             }
         };
         tokio::time::timeout(timeout, wait).await.is_ok()
+    }
+
+    fn has_thread_ended(&self) -> bool {
+        let thread = locked(&self.thread);
+        thread.as_ref().is_none_or(JoinHandle::is_finished)
     }
 
     fn is_complete(&self) -> bool {
@@ -659,18 +680,35 @@ mod tests {
         }
     }
 
-    #[test]
-    fn recordings_are_listed_while_the_storage_of_a_new_one_is_slow() {
-        let directory = tempfile::tempdir().unwrap();
-        let recordings = Recordings::new(Components::in_directory(directory.path()));
-        let wanted = RecordingOptions {
-            name: Some("slow".to_owned()),
+    fn wanted(name: &str) -> RecordingOptions {
+        RecordingOptions {
+            name: Some(name.to_owned()),
             requested: FilterOptions::everything(),
             domain_id: 0,
             options: Options::default(),
             paused: false,
-        };
-        let begun = recordings.begin_with(wanted, |directory, options| {
+        }
+    }
+
+    /// Earlier, the end of the agent waited without bound for the compression of whole files.
+    #[test]
+    fn a_recording_that_completes_too_slowly_is_aborted_at_the_end_of_the_agent() {
+        let directory = tempfile::tempdir().unwrap();
+        let recordings = Recordings::new(Components::in_directory(directory.path()));
+        let recording = recordings.begin(wanted("drive")).unwrap();
+        // Without a clock of the source, it would wait for messages in flight.
+        let begun = Instant::now();
+        recordings.finish_within(Duration::ZERO);
+        assert!(begun.elapsed() < session::DRAIN_TIMEOUT);
+        assert_eq!(recording.status().state, RecordingState::Ended);
+        assert!(recording.directory.join("metadata.yaml").exists());
+    }
+
+    #[test]
+    fn recordings_are_listed_while_the_storage_of_a_new_one_is_slow() {
+        let directory = tempfile::tempdir().unwrap();
+        let recordings = Recordings::new(Components::in_directory(directory.path()));
+        let begun = recordings.begin_with(wanted("slow"), |directory, options| {
             assert!(recordings.list.try_lock().is_ok(), "the list is locked");
             assert!(recordings.all().is_empty() && recordings.find("slow").is_none());
             Writer::create(directory, options)

@@ -481,9 +481,9 @@ impl Run {
     /// the next packets.
     fn confirm_requests(&mut self) {
         if let Some(sample_requests) = self.sample_requests.take() {
-            let observer = &mut self.observer;
+            let (observer, now) = (&mut self.observer, self.source.clock());
             (self.subscriptions)
-                .confirm_applied(&sample_requests, |request| observer.latched(request));
+                .confirm_applied(&sample_requests, now, |request| observer.latched(request));
             self.unconfirmed = Some((Arc::clone(&sample_requests), Instant::now()));
             if sample_requests.is_empty() {
                 // Buffers of large messages are free now, and the next subscription may begin much

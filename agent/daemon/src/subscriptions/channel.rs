@@ -37,6 +37,8 @@ pub(super) struct Channel {
     changed: Condvar,
     is_applied: AtomicBool,
     known: Notify,
+    /// Whether the stream continues when a replay that has ended begins again.
+    outlives_end: AtomicBool,
 }
 
 /// Topics of the reader.
@@ -116,6 +118,7 @@ impl Channel {
             changed: Condvar::new(),
             is_applied: AtomicBool::new(false),
             known: Notify::new(),
+            outlives_end: AtomicBool::new(false),
         }
     }
 
@@ -226,11 +229,26 @@ impl Channel {
         self.wake();
     }
 
+    /// Makes the stream continue when a replay that has ended begins again.
+    pub(super) fn outlive_end(&self) {
+        self.outlives_end.store(true, Ordering::Relaxed);
+    }
+
+    /// Continues the stream if it outlives its end.
+    pub(super) fn begin_again(&self) {
+        if self.outlives_end.load(Ordering::Relaxed) {
+            let mut queue = self.lock();
+            (queue.end, queue.closed) = (None, false);
+        }
+    }
+
     /// Closes the stream for its reader.
     pub(super) fn close(&self) {
         let mut queue = self.lock();
         queue.closed = true;
         queue.waiting = Backlog::default();
+        // The capture thread may still have this channel in its list of those to evict from.
+        self.bytes.store(0, Ordering::Relaxed);
         drop(queue);
         self.changed.notify_all();
     }
@@ -344,10 +362,12 @@ impl Channel {
 
     /// Evicts an entry. Returns `false` if the queue is empty.
     fn drop_one(&self, queue: &mut Queue) -> bool {
-        let Some(item) = queue.waiting.evict_least_important() else {
+        let evicted = queue.waiting.evict_least_important();
+        // Also without an entry, so that no caller evicts from an empty queue twice.
+        self.bytes.store(queue.waiting.bytes(), Ordering::Relaxed);
+        let Some(item) = evicted else {
             return false;
         };
-        self.bytes.store(queue.waiting.bytes(), Ordering::Relaxed);
         match item {
             Item::Sample(sample) => {
                 queue.uncounted += 1;

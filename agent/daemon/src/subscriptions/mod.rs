@@ -68,7 +68,8 @@ pub struct Request {
     /// Treatment of samples that do not fit.
     pub overflow: Overflow,
     /// Whether [`Item::Clock`] comes only after samples that wait for lower numbers: by some seconds
-    /// later while a reliable writer repeats a sample.
+    /// later while a reliable writer repeats a sample. The kept last messages then have the time of
+    /// their delivery, so that a recording does not begin before itself.
     pub is_clock_complete: bool,
     /// Whether a reader with payloads first receives the kept last messages of its topics.
     pub latched: bool,
@@ -255,10 +256,11 @@ impl Subscriptions {
 
     /// For the capture thread: handles requests that are now in force in the model and the kernel.
     /// Readers first receive the last messages of topics that are new to them, which `latched`
-    /// returns.
+    /// returns. `now` is the clock of the source.
     pub fn confirm_applied(
         &self,
         sample_requests: &[SampleRequest],
+        now: Timestamp,
         mut latched: impl FnMut(&SampleRequest) -> Vec<Arc<Sample>>,
     ) {
         for channel in self.channels.load().iter() {
@@ -274,7 +276,10 @@ impl Subscriptions {
                     selection: fresh,
                     ..request.clone()
                 };
-                for sample in latched(&fresh) {
+                for mut sample in latched(&fresh) {
+                    if channel.is_clock_complete() && sample.time < now {
+                        Arc::make_mut(&mut sample).time = now;
+                    }
                     self.enqueued.fetch_add(1, Ordering::Relaxed);
                     channel.sample(&sample, None, &self.stop);
                 }
@@ -347,12 +352,14 @@ impl Subscriptions {
         }
     }
 
-    /// For the capture thread: a replay begins again. All requests count as changed, and new
-    /// subscriptions receive samples again.
+    /// For the capture thread: a replay begins again. All requests count as changed. New
+    /// subscriptions, and those that outlive their end, receive samples again.
     pub fn begin_again(&self) {
         let mut opened = self.lock_channels();
         opened.ended = None;
-        self.change(self.channels.load().to_vec());
+        let channels = self.channels.load().to_vec();
+        channels.iter().for_each(|channel| channel.begin_again());
+        self.change(channels);
     }
 
     fn sample(&self, channels: &[Arc<Channel>], to: &[u64], sample: &Arc<Sample>) {
@@ -466,6 +473,12 @@ impl Subscription {
     #[must_use]
     pub fn begin(&self) -> Begin {
         Begin(Arc::clone(&self.channel))
+    }
+
+    /// Makes the subscription continue when a replay that has ended begins again, even after
+    /// [`Item::End`]. Use it only with [`Overflow::DropOldest`].
+    pub fn outlive_end(&self) {
+        self.channel.outlive_end();
     }
 
     /// Returns the selection of topics.

@@ -198,6 +198,24 @@ fn all_queues_together_stay_within_their_cap_and_a_payload_counts_once() {
 }
 
 #[test]
+fn room_is_not_made_in_the_queue_of_a_reader_that_closed() {
+    let all = subscriptions(caps());
+    let open = || all.open(request(Depth::Payloads, 1 << 16, Overflow::DropOldest));
+    let (closed, mut open) = (open().unwrap(), open().unwrap());
+    all.deliver(vec![enqueued(&[1], 1, Some(5000))], None);
+    all.deliver(vec![enqueued(&[2], 2, Some(1000))], None);
+    // The capture thread has loaded its list when the reader closes.
+    let channels = all.channels.load_full();
+    drop(closed);
+    let droppable: Vec<usize> = channels.iter().map(|channel| channel.droppable()).collect();
+    assert_eq!(droppable, [0, 1256]);
+    let _other = channel::QueuedBytes::new(&all.queued, caps().bytes);
+    all.make_room(&channels);
+    assert_eq!(all.facts().crowded_out, 1);
+    assert!(numbers(&mut open).is_empty());
+}
+
+#[test]
 fn during_a_replay_the_source_waits_for_readers_but_not_for_closed_ones() {
     let all = subscriptions(caps());
     let mut reader = all
@@ -305,7 +323,7 @@ async fn a_reader_receives_its_items_and_then_the_end() {
         .unwrap();
     assert!(!reader.in_force(Duration::from_millis(1)).await);
     let requests = all.take_changed().unwrap();
-    all.confirm_applied(&requests, |_| Vec::new());
+    all.confirm_applied(&requests, Timestamp(0), |_| Vec::new());
     assert!(!reader.in_force(Duration::from_millis(1)).await);
     all.confirm(&requests);
     assert!(reader.in_force(LONG).await);
@@ -338,10 +356,34 @@ fn kept_messages_are_sent_first_unless_the_request_excludes_them() {
             })
             .unwrap();
         let requests = all.take_changed().unwrap();
-        all.confirm_applied(&requests, |_| vec![sample(1, Some(5))]);
+        all.confirm_applied(&requests, Timestamp(9), |_| vec![sample(1, Some(5))]);
         let id = requests[0].id;
         all.deliver(vec![enqueued(&[id], 2, Some(5))], None);
         assert_eq!(numbers(&mut reader), received);
+    }
+}
+
+/// Earlier, the bag of a late recording began when its latched messages were sent.
+#[test]
+fn a_recording_receives_kept_messages_at_its_start_and_a_viewer_at_their_arrival() {
+    let all = subscriptions(caps());
+    for (is_clock_complete, times) in [(true, [9, 12]), (false, [3, 12])] {
+        let mut reader = all
+            .open(Request {
+                is_clock_complete,
+                ..request(Depth::Payloads, 1 << 16, Overflow::DropOldest)
+            })
+            .unwrap();
+        let requests = all.take_changed().unwrap();
+        // The clock of the source was set back after the second arrived.
+        let kept = |_: &SampleRequest| vec![sample(3, Some(5)), sample(12, Some(5))];
+        all.confirm_applied(&requests, Timestamp(9), kept);
+        for time in times {
+            let Some(Item::Sample(sample)) = reader.try_next() else {
+                panic!("a kept message is missing");
+            };
+            assert_eq!(sample.time, Timestamp(time));
+        }
     }
 }
 

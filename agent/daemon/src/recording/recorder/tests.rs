@@ -192,6 +192,22 @@ fn samples_during_a_pause_are_not_recorded() {
 }
 
 #[test]
+fn a_snapshot_during_a_pause_writes_the_messages_before_it() {
+    let directory = tempfile::tempdir().unwrap();
+    let recorder = recorder(&directory.path().join("bag"), FilterOptions::everything());
+    let mut recorder = recorder.with_ring(SampleRing::new(1 << 20, None));
+    recorder.take(&sample("/a", 1)).unwrap();
+    recorder.pause(true);
+    recorder.take(&sample("/a", 2)).unwrap();
+    recorder.snapshot().unwrap();
+    assert!(recorder.is_paused());
+    recorder.take(&sample("/a", 3)).unwrap();
+    let ended = recorder.finish(None);
+    assert_eq!(numbers(&ended), [("/a".to_owned(), 1)]);
+    assert_eq!(ended.report.topics["/a"].paused, 2);
+}
+
+#[test]
 fn a_topic_of_two_types_is_recorded_with_the_first_and_reported() {
     let directory = tempfile::tempdir().unwrap();
     let mut recorder = recorder(&directory.path().join("bag"), FilterOptions::everything());
@@ -209,6 +225,45 @@ fn a_topic_of_two_types_is_recorded_with_the_first_and_reported() {
     assert_eq!(ended.report.left_out, ["/a"]);
 }
 
+/// Returns a topic with a publisher of `std_msgs/msg/String` and a subscriber of another type.
+fn two_types() -> DiscoveredTopic {
+    DiscoveredTopic {
+        message_types: ["std_msgs/msg/Int32", "std_msgs/msg/String"]
+            .map(str::to_owned)
+            .into(),
+        subscribed: true,
+        ..durable_publishers()
+    }
+}
+
+/// Earlier, the subscriber's type described the topic, and every message was left out.
+#[test]
+fn a_subscriber_of_another_type_does_not_keep_messages_out_of_the_bag() {
+    let directory = tempfile::tempdir().unwrap();
+    let mut recorder = recorder(&directory.path().join("bag"), FilterOptions::everything());
+    recorder.sources.announced = Box::new(|names| names.iter().map(|_| two_types()).collect());
+    let types = two_types().message_types;
+    recorder.declare([("/a", types.as_slice())]).unwrap();
+    // A loss before the first message has no type in a client.
+    let missed = Missed {
+        topic: topic("/a", ""),
+        writer: writer(1),
+        first: SequenceNumber(1),
+        last: SequenceNumber(3),
+        samples: 3,
+        reason: MissedReason::Lost,
+    };
+    recorder.take(&Item::Missed(missed)).unwrap();
+    recorder.take(&sample("/a", 4)).unwrap();
+    let ended = recorder.finish(None);
+    assert_eq!(numbers(&ended), [("/a".to_owned(), 4)]);
+    assert!(ended.report.left_out.is_empty());
+    assert_eq!(
+        (ended.report.missing, ended.report.missing_runs_unnamed),
+        (3, 1)
+    );
+}
+
 #[test]
 fn messages_sent_before_the_recording_are_reported_unless_they_are_recorded() {
     for (number, expected) in [(1, 0), (2, 1)] {
@@ -222,8 +277,8 @@ fn messages_sent_before_the_recording_are_reported_unless_they_are_recorded() {
     let directory = tempfile::tempdir().unwrap();
     let mut recorder = recorder(&directory.path().join("bag"), FilterOptions::everything());
     let topics = [
-        ("/tf_static", "tf2_msgs/msg/TFMessage"),
-        ("/nobody", "std_msgs/msg/String"),
+        ("/tf_static", &["tf2_msgs/msg/TFMessage"][..]),
+        ("/nobody", &["std_msgs/msg/String"][..]),
     ];
     recorder.declare(topics).unwrap();
     let ended = recorder.finish(None);

@@ -78,7 +78,8 @@ impl SnapshotTask {
         }
     }
 
-    /// Runs until `stop`, then completes the open bag.
+    /// Runs until `stop`, then completes the open bag. A replay that goes back from its end is
+    /// followed again.
     pub(super) fn run(
         mut self,
         mut subscription: Subscription,
@@ -86,12 +87,16 @@ impl SnapshotTask {
         signalled: &AtomicBool,
         stop: &AtomicBool,
     ) {
+        subscription.outlive_end();
         let mut looked = Instant::now();
         while !stop.load(Ordering::Relaxed) {
+            let asked = Instant::now();
             let item = subscription.next_blocking(POLL_INTERVAL);
             let is_clock = matches!(item, Some(Item::Clock(_)));
-            if let Some(item) = item {
-                self.take(item);
+            match item {
+                Some(item) => self.take(item),
+                // After the end of the source, the call returns at once.
+                None => std::thread::sleep(POLL_INTERVAL.saturating_sub(asked.elapsed())),
             }
             if is_clock {
                 // A replay may skip many seconds between two polls.
@@ -146,7 +151,7 @@ impl SnapshotTask {
                 self.missed.retain(|(at, _)| now.distance(*at) <= span);
             }
             Item::Missed(missed) => self.note_missed(missed),
-            Item::End(_) => std::thread::sleep(POLL_INTERVAL),
+            Item::End(_) => {}
         }
     }
 

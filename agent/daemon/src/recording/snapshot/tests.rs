@@ -3,7 +3,9 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
-use std::time::{Duration, SystemTime};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::sync_channel;
+use std::time::{Duration, Instant, SystemTime};
 
 use ros2probe_bag::metadata::{self, Metadata};
 use ros2probe_model::facts::calls::facts::Owner;
@@ -11,7 +13,7 @@ use ros2probe_model::facts::calls::report as inside;
 use ros2probe_model::facts::calls::{late, other_thread};
 use ros2probe_model::facts::churn;
 use ros2probe_model::facts::diagnosis::{Diagnosis, TopicKey};
-use ros2probe_model::facts::dispatch::Sample;
+use ros2probe_model::facts::dispatch::{Dispatch, Sample, SampleOutcome};
 use ros2probe_model::facts::event::{Event, EventKind, Taken};
 use ros2probe_model::facts::topic_kind::TopicKind;
 use ros2probe_wire::rtps::VendorId;
@@ -25,7 +27,7 @@ use crate::config::SnapshotSettings;
 use crate::events::{EventLog, Trigger};
 use crate::recording::service::{Components, Recordings};
 use crate::recording::{RecordingFigures, SnapshotFigures};
-use crate::subscriptions::{Item, Missed, MissedReason, Topic};
+use crate::subscriptions::{Item, Missed, MissedReason, Selection, Subscriptions, Topic};
 
 const TENTH: u64 = SECOND / 10;
 
@@ -34,6 +36,8 @@ struct Robot {
     directory: TempDir,
     events: Arc<EventLog>,
     figures: Arc<RecordingFigures>,
+    recordings: Arc<Recordings>,
+    subscriptions: Arc<Subscriptions>,
     task: SnapshotTask,
     topic: Arc<Topic>,
     now: u64,
@@ -73,7 +77,8 @@ impl Robot {
             Arc::clone(&components.events),
             Arc::clone(&components.figures),
         );
-        let recordings = Recordings::new(components);
+        let subscriptions = Arc::clone(&components.subscriptions);
+        let recordings = Arc::new(Recordings::new(components));
         let topic = Topic {
             domain_id: DomainId(0),
             name: "/imu".into(),
@@ -85,7 +90,9 @@ impl Robot {
             directory,
             events,
             figures,
-            task: SnapshotTask::new(settings, Arc::new(recordings)),
+            task: SnapshotTask::new(settings, Arc::clone(&recordings)),
+            recordings,
+            subscriptions,
             topic: Arc::new(topic),
             now: 100 * SECOND / TENTH,
             payload: 64,
@@ -95,21 +102,25 @@ impl Robot {
     /// Publishes for some tenths of a second.
     fn run(&mut self, tenths: u64) {
         for _ in 0..tenths {
-            self.now += 1;
-            let sample = Sample {
-                topic: Arc::clone(&self.topic),
-                time: self.time(),
-                writer: Guid::default(),
-                sequence_number: SequenceNumber(self.now),
-                source_timestamp: None,
-                header_stamp: None,
-                size: 64,
-                sampled: false,
-                payload: Some(vec![0; self.payload].into()),
-            };
-            self.task.take(Item::Sample(Arc::new(sample)));
+            let sample = self.next_sample();
+            self.task.take(Item::Sample(sample));
             self.pass();
         }
+    }
+
+    fn next_sample(&mut self) -> Arc<Sample> {
+        self.now += 1;
+        Arc::new(Sample {
+            topic: Arc::clone(&self.topic),
+            time: self.time(),
+            writer: Guid::default(),
+            sequence_number: SequenceNumber(self.now),
+            source_timestamp: None,
+            header_stamp: None,
+            size: 64,
+            sampled: false,
+            payload: Some(vec![0; self.payload].into()),
+        })
     }
 
     fn pass(&mut self) {
@@ -649,6 +660,67 @@ fn an_agent_that_stops_completes_the_open_bag() {
     robot.task.complete(None);
     assert_eq!(robot.only_bag().len(), 16);
     assert_eq!(robot.shown().written, 1);
+}
+
+/// Returns the processor time of this thread in ticks, of which a second has 100.
+fn ticks_of_this_thread() -> u64 {
+    let text = std::fs::read_to_string("/proc/thread-self/stat").unwrap();
+    let (_, fields) = text.rsplit_once(") ").unwrap();
+    let ticks = fields.split(' ').skip(11).take(2);
+    ticks.map(|ticks| ticks.parse::<u64>().unwrap()).sum()
+}
+
+/// Earlier, the thread used a whole processor from the end of a replay on, and recorded nothing
+/// after the replay had gone back.
+#[test]
+fn a_snapshot_sleeps_at_the_end_of_a_replay_and_continues_when_it_goes_back() {
+    let mut robot = Robot::new(settings(&[], 3, 0));
+    let dispatches = [(); 2].map(|()| Dispatch {
+        to: [1].into(),
+        outcome: SampleOutcome::Sample(robot.next_sample()),
+    });
+    let Robot {
+        directory,
+        figures,
+        recordings,
+        subscriptions,
+        task,
+        ..
+    } = robot;
+    let selection = Selection::named(["/imu"]).unwrap();
+    let subscription = recordings.open(selection, 0, "incident").unwrap();
+    let (_clients, waiting) = sync_channel(1);
+    let stop = Arc::new(AtomicBool::new(false));
+    let stopping = Arc::clone(&stop);
+    let thread = std::thread::spawn(move || {
+        task.run(subscription, &waiting, &AtomicBool::new(false), &stopping);
+        ticks_of_this_thread()
+    });
+    let wait_for = |messages| {
+        let deadline = Instant::now() + Duration::from_secs(60);
+        let is_reached = || {
+            let snapshots = figures.snapshots();
+            snapshots
+                .iter()
+                .any(|(_, shown)| shown.messages == messages)
+        };
+        while !is_reached() {
+            assert!(Instant::now() < deadline, "{messages} messages");
+            std::thread::sleep(Duration::from_millis(10));
+        }
+    };
+    let [first, second] = dispatches;
+    subscriptions.deliver(vec![first], None);
+    subscriptions.end("end of capture");
+    wait_for(1);
+    std::thread::sleep(Duration::from_secs(1));
+    subscriptions.begin_again();
+    subscriptions.deliver(vec![second], None);
+    wait_for(2);
+    stop.store(true, Ordering::Relaxed);
+    let ticks = thread.join().unwrap();
+    assert!(ticks < 50, "{ticks}");
+    drop(directory);
 }
 
 #[test]
