@@ -5,6 +5,7 @@
 //! the datagram is complete. Until then the records wait here, bounded in number and time.
 
 use std::collections::{HashMap, VecDeque};
+use std::time::Duration;
 
 use ros2probe_model::facts::bounded::{Bounded, Sum};
 use ros2probe_wire::Timestamp;
@@ -15,7 +16,7 @@ use crate::tables::{AheadBytes, AheadDatagrams, AheadRecords};
 
 /// Time after which an incomplete datagram is discarded. By default, Linux waits as long for
 /// fragments of IPv4 (`ipfrag_time`), and twice as long for those of IPv6 (`ip6frag_time`).
-const LIFETIME_NANOSECONDS: i64 = 30_000_000_000;
+const LIFETIME: Duration = Duration::from_secs(30);
 
 /// A complete item for the model.
 #[derive(Debug)]
@@ -96,10 +97,9 @@ impl Ahead {
         self.complete_datagram(token, ready);
     }
 
-    /// Discards datagrams that can no longer become complete.
+    /// Discards datagrams that can no longer become complete. The clock may have been set back.
     pub fn advance(&mut self, now: Timestamp) {
-        let is_late =
-            |(born, _): &mut (Timestamp, _)| now.nanoseconds_since(*born) > LIFETIME_NANOSECONDS;
+        let is_late = |(born, _): &mut (Timestamp, _)| now.distance(*born) > LIFETIME;
         while let Some(oldest) = self.oldest.pop_front_if(is_late) {
             self.discard(Some(oldest));
         }
@@ -212,6 +212,15 @@ mod tests {
         ahead.advance(Timestamp(31_000_000_000));
         assert_eq!(ahead.discarded(), 1);
         assert!(taken(&mut ahead, record(9, kind::COMPLETE, 0, 2)).is_empty());
+    }
+
+    #[test]
+    fn incomplete_datagrams_are_discarded_after_the_clock_was_set_back() {
+        let hour = 3_600_000_000_000;
+        let mut ahead = Ahead::default();
+        assert!(taken(&mut ahead, record(9, kind::DATA, flag::AHEAD, 2 * hour)).is_empty());
+        ahead.advance(Timestamp(hour));
+        assert_eq!((ahead.discarded(), ahead.waiting.len()), (1, 0));
     }
 
     #[test]

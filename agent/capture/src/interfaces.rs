@@ -76,6 +76,8 @@ pub struct Interfaces {
     known: Known,
     sequence: u32,
     buffer: Vec<u8>,
+    /// Whether changes were missed, so that only a new list is correct.
+    is_stale: bool,
 }
 
 /// Selects interfaces by name.
@@ -99,8 +101,9 @@ impl Interfaces {
             known: Known::default(),
             sequence: 0,
             buffer: vec![0; MAX_MESSAGE_BYTES],
+            is_stale: false,
         };
-        interfaces.list()?;
+        interfaces.list(&mut Vec::new())?;
         Ok(interfaces)
     }
 
@@ -115,17 +118,16 @@ impl Interfaces {
         self.known.get(&index)
     }
 
-    /// Returns the changes since the last call. Does not wait.
-    ///
-    /// # Errors
-    /// Fails if the kernel reports an error; known interfaces stay known.
-    pub fn changes(&mut self) -> Result<Vec<Change>, InterfacesError> {
+    /// Returns the changes since the last call. Does not wait. If the kernel reports an error, known
+    /// interfaces stay known, and the next call lists all.
+    pub fn changes(&mut self) -> Vec<Change> {
         let mut changes = Vec::new();
-        if self.drain(&mut changes)? {
-            // Messages were lost: only a new list shows the missed changes.
-            changes.extend(self.list()?);
+        // A message that cannot be read may be a change.
+        self.is_stale |= self.drain(&mut changes).unwrap_or(true);
+        if self.is_stale {
+            self.is_stale = self.list(&mut changes).is_err();
         }
-        Ok(changes)
+        changes
     }
 
     /// Reads waiting messages; returns `true` if the kernel dropped some.
@@ -151,12 +153,12 @@ impl Interfaces {
         }
     }
 
-    /// Requests all interfaces and compares them with the known ones.
-    fn list(&mut self) -> Result<Vec<Change>, InterfacesError> {
-        let mut changes = Vec::new();
+    /// Requests all interfaces and compares them with the known ones. Also after an error, `changes`
+    /// has every change of the known ones.
+    fn list(&mut self, changes: &mut Vec<Change>) -> Result<(), InterfacesError> {
         'attempt: for _ in 0..MAX_ATTEMPTS {
             // Waiting messages are older than the list, and messages after them may be lost.
-            self.drain(&mut changes)?;
+            self.drain(changes)?;
             self.request()?;
             let mut listed = BTreeSet::new();
             let mut interrupted = false;
@@ -200,7 +202,7 @@ impl Interfaces {
                             }
                             is_listed
                         });
-                        return Ok(changes);
+                        return Ok(());
                     }
                     Some(error) => {
                         let source = io::Error::from_raw_os_error(error.saturating_neg());
@@ -271,6 +273,14 @@ impl Selection {
     #[must_use]
     pub fn names(&self, name: &str) -> bool {
         self.named.contains(name) && self.accepts(name)
+    }
+
+    /// Iterates over the names of accepted interfaces that the configuration contains exactly, not
+    /// as a pattern.
+    pub fn exact_names(&self) -> impl Iterator<Item = &str> {
+        let is_pattern = |name: &str| name.contains(['*', '?', '[', '{', '\\']);
+        let names = self.named.iter().map(String::as_str);
+        names.filter(move |name| !is_pattern(name) && self.accepts(name))
     }
 
     /// Returns whether an interface is observed before its name is known. Interfaces outside of
@@ -412,6 +422,8 @@ fn listen() -> Result<OwnedFd, InterfacesError> {
 
 #[cfg(test)]
 mod tests {
+    use std::os::unix::net::UnixDatagram;
+
     use super::*;
     use crate::netns::tests::{in_new_namespace, ip};
     use crate::tables::tests::assert_driven;
@@ -441,15 +453,22 @@ mod tests {
     }
 
     #[test]
+    fn exact_names_are_accepted_names_without_a_pattern() {
+        let include = globs(&["eth0", "wlan*", "vcan?", "en[op]0", "can{0,1}", "lo"]);
+        let selection = Selection::new(&include, &globs(&["lo"])).unwrap();
+        assert_eq!(selection.exact_names().collect::<Vec<_>>(), ["eth0"]);
+    }
+
+    #[test]
     fn interfaces_are_listed_and_their_changes_are_reported() {
         in_new_namespace(|| {
             let mut interfaces = Interfaces::open().unwrap();
             let lo = interfaces.by_index(1).unwrap().clone();
             assert_eq!((lo.name.as_str(), lo.hardware, lo.up), ("lo", 772, true));
-            interfaces.changes().unwrap();
+            interfaces.changes();
 
             ip("link add one type veth peer name two");
-            let Some(Change::Present(one)) = change(&interfaces.changes().unwrap(), "one") else {
+            let Some(Change::Present(one)) = change(&interfaces.changes(), "one") else {
                 panic!("a new interface is not seen");
             };
             assert_eq!((one.hardware, one.up), (1, false));
@@ -459,7 +478,7 @@ mod tests {
                 ..one.clone()
             };
             assert_eq!(
-                change(&interfaces.changes().unwrap(), "one"),
+                change(&interfaces.changes(), "one"),
                 Some(Change::Present(up))
             );
             ip("link set one down");
@@ -469,17 +488,17 @@ mod tests {
                 ..one
             };
             assert_eq!(
-                change(&interfaces.changes().unwrap(), "renamed"),
+                change(&interfaces.changes(), "renamed"),
                 Some(Change::Present(renamed.clone()))
             );
             assert_eq!(interfaces.by_index(renamed.index), Some(&renamed));
             ip("link delete renamed");
             assert_eq!(
-                change(&interfaces.changes().unwrap(), "renamed"),
+                change(&interfaces.changes(), "renamed"),
                 Some(Change::Gone(renamed.clone()))
             );
             assert_eq!(interfaces.by_index(renamed.index), None);
-            assert_eq!(interfaces.changes().unwrap(), []);
+            assert_eq!(interfaces.changes(), []);
         });
     }
 
@@ -490,9 +509,9 @@ mod tests {
             ip("link add port type veth peer name far");
             ip("link add bridge type bridge");
             ip("link set port master bridge");
-            interfaces.changes().unwrap();
+            interfaces.changes();
             ip("link set port nomaster");
-            let changes = interfaces.changes().unwrap();
+            let changes = interfaces.changes();
             assert!(
                 !matches!(change(&changes, "port"), Some(Change::Gone(_))),
                 "{changes:?}"
@@ -546,7 +565,7 @@ mod tests {
             std::fs::write(file.path(), commands).unwrap();
             ip(&format!("-batch {}", file.path().display()));
             ip("link delete flood");
-            interfaces.changes().unwrap();
+            interfaces.changes();
             let names: Vec<_> = interfaces
                 .iter()
                 .map(|interface| interface.name.as_str())
@@ -555,13 +574,11 @@ mod tests {
         });
     }
 
-    #[test]
-    fn a_malformed_answer_never_causes_a_panic() {
+    /// Returns messages of the kernel: that interface 1 exists and is up, and the end of a list.
+    fn list_of_one(name: &[u8; 8]) -> Vec<u8> {
         let mut bytes = Vec::new();
-        for (kind, attribute) in [
-            (libc::RTM_NEWLINK, &b"\x09\0\x03\0lo\0\0\0\0\0\0"[..]),
-            (3, &[0; 4]),
-        ] {
+        let attribute = [&b"\x09\0\x03\0"[..], name].concat();
+        for (kind, attribute) in [(libc::RTM_NEWLINK, &attribute[..]), (3, &[0; 4])] {
             let body = if kind == 3 {
                 vec![]
             } else {
@@ -574,6 +591,38 @@ mod tests {
             bytes.extend_from_slice(&body);
             bytes.extend_from_slice(attribute);
         }
+        bytes
+    }
+
+    #[test]
+    fn a_failed_list_loses_no_change_and_is_repeated() {
+        in_new_namespace(|| {
+            let mut interfaces = Interfaces::open().unwrap();
+            // This kernel reports a change, then something unreadable, and no list.
+            let (kernel, socket) = UnixDatagram::pair().unwrap();
+            socket.set_nonblocking(true).unwrap();
+            kernel.send(&list_of_one(b"eth0\0\0\0\0")).unwrap();
+            kernel.send(&[1, 0, 0]).unwrap();
+            let socket = File::from(OwnedFd::from(socket));
+            let own = std::mem::replace(&mut interfaces.socket, socket);
+            let names = |changes: Vec<Change>| {
+                let names = changes.into_iter().map(|change| match change {
+                    Change::Present(interface) | Change::Gone(interface) => interface.name,
+                });
+                names.collect::<Vec<_>>()
+            };
+            assert_eq!(names(interfaces.changes()), ["eth0"]);
+            assert_eq!(names(interfaces.changes()), [""; 0]);
+            // The list of the other kernel shows that the interface has another name.
+            interfaces.socket = own;
+            assert_eq!(names(interfaces.changes()), ["lo"]);
+            assert!(!interfaces.is_stale);
+        });
+    }
+
+    #[test]
+    fn a_malformed_answer_never_causes_a_panic() {
+        let bytes = list_of_one(b"lo\0\0\0\0\0\0");
         let mut seen = Vec::new();
         read(&bytes, |message| seen.push(message)).unwrap();
         assert!(matches!(&seen[..], [

@@ -674,12 +674,22 @@ impl LiveSource {
         self.without_exact.as_deref()
     }
 
-    /// Returns a sentence about an observed object that no longer exists and yields no data; `None`
-    /// if all exist.
+    /// Returns a sentence about a configured object that does not exist and yields no data; `None` if
+    /// all exist.
     #[must_use]
     pub fn missing_object(&self) -> Option<String> {
         let cgroup = self.host.as_ref().and_then(HostTap::detached);
-        cgroup.or_else(|| self.wires.iter().find_map(WireTap::missing_object))
+        let gone = || self.wires.iter().find_map(WireTap::missing_object);
+        cgroup.or_else(gone).or_else(|| self.absent_interface())
+    }
+
+    /// Returns a sentence about an interface that the configuration names and that no observed
+    /// namespace has had since the start.
+    fn absent_interface(&self) -> Option<String> {
+        let mut names = self.wires.first()?.named_interfaces();
+        let is_absent = |name: &&str| !self.wires.iter().any(|wire| wire.has_known(name));
+        let name = names.find(is_absent)?;
+        Some(format!("the interface {name} does not exist"))
     }
 
     /// Returns a sentence about what is not observed yet after the start; `None` if everything is

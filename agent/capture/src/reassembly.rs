@@ -269,13 +269,14 @@ impl Reassembly {
         self.finish(key)
     }
 
-    /// Discards datagrams that have waited too long at the time `now`.
+    /// Discards datagrams that have waited too long at the time `now`. If they began long after it,
+    /// the clock was set back.
     pub fn advance(&mut self, now: Timestamp) {
         while let Some(key) = self.oldest() {
             let fresh = self
                 .flows
                 .get(&key)
-                .is_some_and(|flow| now.0.saturating_sub(flow.first_seen.0) <= self.limits.timeout);
+                .is_some_and(|flow| now.0.abs_diff(flow.first_seen.0) <= self.limits.timeout);
             if fresh {
                 break;
             }
@@ -283,7 +284,7 @@ impl Reassembly {
             self.counters.timed_out += 1;
         }
         let remember = self.limits.finished_lifetime;
-        let is_old = |(at, _): &mut (Timestamp, _)| now.0.saturating_sub(at.0) > remember;
+        let is_old = |(at, _): &mut (Timestamp, _)| now.0.abs_diff(at.0) > remember;
         while let Some((_, key)) = self.finished_order.pop_front_if(is_old) {
             self.finished.remove(&key);
         }

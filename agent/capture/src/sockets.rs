@@ -82,8 +82,21 @@ impl Sockets {
         }
         let groups: BTreeSet<u64> = met.values().map(|socket| socket.cgroup).collect();
         self.groups.refresh(&groups);
-        for (cookie, socket) in &met {
+        self.report(&met, asked, observer);
+        if is_awaited {
+            observer.input(Input::SocketsRead);
+        }
+    }
+
+    /// Passes new and changed facts to the model. `asked` = the owners were queried just before.
+    fn report(&mut self, met: &BTreeMap<u64, Socket>, asked: bool, observer: &mut Observer) {
+        for (cookie, socket) in met {
             let known = self.known.entry(*cookie).or_default();
+            if known.reported.is_none() && !known.may_be_open() {
+                // The socket was reported as closed, but is still in the hook's table. Facts would
+                // open it again for the model.
+                continue;
+            }
             if !asked && known.reported.is_some() && known.rcvbuf_errors == socket.rcvbuf_errors {
                 continue;
             }
@@ -93,9 +106,6 @@ impl Sockets {
                 known.reported = Some(facts.clone());
                 observer.input(Input::Socket(facts));
             }
-        }
-        if is_awaited {
-            observer.input(Input::SocketsRead);
         }
     }
 
@@ -274,5 +284,26 @@ mod tests {
         assert_eq!(questions(&all, 2), 2);
         all.forget(&sockets(&[2], 0), &mut observer);
         assert_eq!(all.known.len(), 1);
+    }
+
+    #[test]
+    fn a_closed_socket_is_reported_again_only_with_a_new_holder() {
+        let mut observer = Observer::new(Settings::default());
+        let mut all = Sockets::new(PathBuf::from("/sys/fs/cgroup"));
+        let met = sockets(&[1], 0);
+        // The hook's table still has the socket after its last holder has ended.
+        for (owners, is_reported) in [
+            (BTreeMap::from([(1, owner(0))]), true),
+            (BTreeMap::new(), false),
+            (BTreeMap::new(), false),
+            (BTreeMap::from([(1, owner(0))]), true),
+        ] {
+            all.poll(owners, &met, &mut observer);
+            all.report(&met, true, &mut observer);
+            assert_eq!(all.known[&1].reported.is_some(), is_reported);
+        }
+        // A socket whose holder is unknown may be open.
+        all.report(&sockets(&[2], 0), false, &mut observer);
+        assert!(all.known[&2].reported.is_some());
     }
 }

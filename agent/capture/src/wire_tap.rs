@@ -5,7 +5,10 @@
 //! time. The tap sends nothing.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::io;
 use std::os::fd::{AsFd as _, BorrowedFd};
+use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -144,7 +147,7 @@ impl WireTap {
     /// namespace is back.
     pub fn check_namespace(&mut self) {
         let Some(path) = &self.path else { return };
-        let is_gone = identity(path) != self.identity;
+        let is_gone = is_replaced(path, self.identity);
         if is_gone == self.is_gone {
             return;
         }
@@ -179,6 +182,17 @@ impl WireTap {
             ),
             None => format!("the interface {interface} is gone"),
         })
+    }
+
+    /// Iterates over the interfaces that the configuration names exactly.
+    pub fn named_interfaces(&self) -> impl Iterator<Item = &str> {
+        self.selection.exact_names()
+    }
+
+    /// Returns whether an interface that the configuration names exists here, or existed.
+    #[must_use]
+    pub fn has_known(&self, interface: &str) -> bool {
+        self.included.0.contains_key(interface)
     }
 
     /// Returns descriptors that are readable when frames, records or interface changes wait.
@@ -293,7 +307,7 @@ impl WireTap {
     /// Applies changes of interfaces. A failed listing is repeated at the next call. A removed
     /// interface leaves no state, because containers come and go for years.
     fn follow_interfaces(&mut self) {
-        let changes = self.interfaces.changes().unwrap_or_default();
+        let changes = self.interfaces.changes();
         if !changes.is_empty() {
             self.included.update(&self.selection, &self.interfaces);
         }
@@ -350,6 +364,15 @@ impl WireTap {
             }
         }
         Ok(())
+    }
+}
+
+/// Returns whether a path is gone or leads to another file than the one with this identity. A path
+/// that cannot be read may still lead to it: that of a process takes privileges that were dropped.
+fn is_replaced(path: &Path, identity: Option<Identity>) -> bool {
+    match fs::metadata(path) {
+        Ok(metadata) => Some((metadata.dev(), metadata.ino())) != identity,
+        Err(error) => error.kind() == io::ErrorKind::NotFound,
     }
 }
 
@@ -587,6 +610,24 @@ mod tests {
     use crate::netns::tests::{in_new_namespace, ip};
 
     #[test]
+    fn a_path_that_cannot_be_read_is_not_gone() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("namespace");
+        fs::write(&path, "").unwrap();
+        let first = identity(&path);
+        assert!(first.is_some() && !is_replaced(&path, first));
+        let kept = directory.path().join("kept");
+        fs::rename(&path, &kept).unwrap();
+        assert!(is_replaced(&path, first));
+        // The kernel refuses to follow a link to itself.
+        std::os::unix::fs::symlink(&path, &path).unwrap();
+        assert!(identity(&path).is_none() && !is_replaced(&path, first));
+        fs::remove_file(&path).unwrap();
+        fs::write(&path, "").unwrap();
+        assert!(is_replaced(&path, first));
+    }
+
+    #[test]
     fn a_configured_interface_is_reported_as_gone_until_it_exists_again() {
         in_new_namespace(|| {
             let names = ["one", "never", "patt*"].map(str::to_owned);
@@ -595,7 +636,7 @@ mod tests {
             let mut included = IncludedInterfaces::default();
             let mut update = |command: &str| {
                 ip(command);
-                interfaces.changes().unwrap();
+                interfaces.changes();
                 included.update(&selection, &interfaces);
                 included.missing().map(str::to_owned)
             };

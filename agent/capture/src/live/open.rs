@@ -2,7 +2,8 @@
 
 use std::path::PathBuf;
 
-use super::super::host_tap::{HostTap, HostTapSettings};
+use super::super::cgroup::CgroupError;
+use super::super::host_tap::{HostTap, HostTapError, HostTapSettings};
 use super::super::interfaces::Selection;
 use super::super::netns;
 use super::super::shm::directories::Scope;
@@ -54,6 +55,12 @@ pub(super) fn open_host(
     match opened {
         Ok(host) => Ok((Some(host), None)),
         Err(error) if settings.source == SourceChoice::Host => Err(error.into()),
+        // The group may be created later, and interfaces would show more than the group.
+        Err(error @ HostTapError::Hierarchy(CgroupError::Open { .. }))
+            if settings.cgroup.is_some() =>
+        {
+            Err(error.into())
+        }
         Err(error) => Ok((None, Some(in_words(&error)))),
     }
 }

@@ -112,6 +112,26 @@ fn a_late_repeated_fragment_does_not_reopen_a_datagram() {
 }
 
 #[test]
+fn finished_and_incomplete_datagrams_are_forgotten_after_the_clock_was_set_back() {
+    let bytes = transport(4000, 0);
+    let parts = fragments(&bytes);
+    let mut reassembly = Reassembly::new(Limits::default());
+    let mut feed = |seconds: u64, id: u32, parts: &[Fragment<'_>]| {
+        let at = Timestamp(seconds * SECOND);
+        let done = parts
+            .iter()
+            .filter_map(|part| reassembly.fragment(at, key(id), part));
+        (done.count(), reassembly.counters().timed_out)
+    };
+    assert_eq!(feed(7200, 1, &parts), (1, 0));
+    assert_eq!(feed(7200, 2, &parts[1..]), (0, 0));
+    // Other datagrams reuse both identifications.
+    assert_eq!(feed(3602, 1, &parts), (1, 1));
+    assert_eq!(feed(3602, 2, &parts), (1, 1));
+    assert_empty(&reassembly);
+}
+
+#[test]
 fn overlapping_fragments_yield_the_datagram() {
     let bytes = transport(4000, 0);
     let parts = [

@@ -318,6 +318,8 @@ impl ShmDirectory {
         self.changed = changed.filter(|_| settled);
         let known = self.files.take();
         let Ok(entries) = fs::read_dir(&self.path) else {
+            // The cause may end without a change of the directory: too many open files.
+            self.changed = None;
             return true;
         };
         let (mut files, mut locks) = (Vec::new(), Vec::new());
@@ -566,6 +568,34 @@ mod tests {
         drop(directory);
         directories.find();
         assert!(directories.directories.is_empty());
+    }
+
+    #[test]
+    fn a_directory_that_could_not_be_read_is_read_again_although_it_did_not_change() {
+        let above = tempfile::tempdir().unwrap();
+        let (path, aside) = (above.path().join("shm"), above.path().join("aside"));
+        let changed = SystemTime::now() - 60 * TIMESTAMP_GRANULARITY;
+        let set_changed = || {
+            let file = fs::File::open(&path).unwrap();
+            file.set_modified(changed).unwrap();
+        };
+        fs::create_dir(&path).unwrap();
+        fs::write(path.join("fastrtps_port7411"), "").unwrap();
+        set_changed();
+        let mut directories = ShmDirectories::new(Scope::Directories(vec![path.clone()]));
+        directories.find();
+        // A file has a time of change, but no entries.
+        fs::rename(&path, &aside).unwrap();
+        fs::write(&path, "").unwrap();
+        set_changed();
+        assert!(directories.list());
+        assert!(files(&directories).is_empty());
+        fs::remove_file(&path).unwrap();
+        fs::rename(&aside, &path).unwrap();
+        set_changed();
+        assert!(directories.list());
+        assert_eq!(files(&directories).len(), 1);
+        assert!(!directories.list());
     }
 
     fn files(directories: &ShmDirectories) -> HashSet<Name> {

@@ -75,7 +75,7 @@ pub struct Facts {
     pub polls: u64,
     /// Factor by which sleeps are extended to stay within the CPU share.
     pub stretch: f64,
-    /// Items lost because the queue was full.
+    /// Items lost because the queue was full, and messages of one poll beyond its caps.
     pub refused: u64,
 }
 
@@ -217,9 +217,10 @@ impl SharedMemory {
     #[must_use]
     pub fn facts(&self) -> Facts {
         let facts = self.shared.facts.lock();
+        let facts = *facts.unwrap_or_else(PoisonError::into_inner);
         Facts {
-            refused: self.shared.inbox.refused(),
-            ..*facts.unwrap_or_else(PoisonError::into_inner)
+            refused: facts.refused + self.shared.inbox.refused(),
+            ..facts
         }
     }
 }
@@ -247,7 +248,7 @@ impl Shared {
             cpu_seconds: seconds(thread_cpu()),
             polls: looks,
             stretch,
-            refused: 0,
+            refused: tap.refused(),
         };
     }
 }
@@ -292,6 +293,7 @@ fn poll(
         }
         if shared.is_paused.load(Ordering::Acquire) {
             tap.close_all();
+            tap.measure_memory_use(monotonic());
             reported = 0;
             shared.report(&tap, looks, interval.stretch());
             shared.progress.set_idle();

@@ -22,7 +22,7 @@ use super::port::Port;
 use super::segment::{Buffer, Message, Refusal};
 use super::source::SharedFile;
 use crate::system::thread_cpu;
-use crate::tables::{AbandonedPorts, Ports, Segments};
+use crate::tables::{AbandonedPorts, InboxBytes, InboxItems, Ports, Segments};
 use recent_messages::{Identity, RecentMessages};
 use ros2probe_model::facts::bounded::Bounded;
 use ros2probe_model::facts::shared_memory::MemoryUse;
@@ -82,6 +82,10 @@ pub struct Tap {
     allowance: CpuAllowance,
     /// Index of the port that is polled first.
     first_port: usize,
+    /// Number of items of the current poll, and bytes of the messages among them.
+    taken_items: usize,
+    taken_bytes: usize,
+    refused: u64,
 }
 
 /// Counters of the tap.
@@ -176,6 +180,9 @@ impl Tap {
             records: Vec::new(),
             allowance: CpuAllowance::default(),
             first_port: 0,
+            taken_items: 0,
+            taken_bytes: 0,
+            refused: 0,
         }
     }
 
@@ -200,6 +207,23 @@ impl Tap {
         for open in self.ports.iter_mut() {
             (open.due, open.busy) = (0, open.busy.max(self.now));
         }
+    }
+
+    /// Measures the use of the directories if that is due, without a poll.
+    pub fn measure_memory_use(&mut self, now: u64) {
+        if !self.is_memory_use_due(now) || !self.may_list(now) {
+            return;
+        }
+        let before = thread_cpu();
+        self.directories.find();
+        self.directories.list();
+        self.last_memory_use = now;
+        self.counters.memory_use = self.directories.memory_use();
+        self.spend(thread_cpu().saturating_sub(before));
+    }
+
+    const fn is_memory_use_due(&self, now: u64) -> bool {
+        self.last_memory_use == 0 || now.saturating_sub(self.last_memory_use) >= MEMORY_USE_INTERVAL
     }
 
     /// Closes every file. The next poll opens the existing ones again.
@@ -243,6 +267,13 @@ impl Tap {
         is_idle.then(|| (self.last_search + FIND_INTERVAL).saturating_sub(now))
     }
 
+    /// Returns the number of messages that were left out, because one poll would have found more
+    /// than its queue holds.
+    #[must_use]
+    pub const fn refused(&self) -> u64 {
+        self.refused
+    }
+
     /// Returns the counters.
     #[must_use]
     pub fn counters(&self) -> Counters {
@@ -260,6 +291,7 @@ impl Tap {
     /// monotonic clock; appends items of interest. Returns the number of announced messages.
     pub fn poll(&mut self, now: u64, found: &mut Vec<Item>) -> usize {
         self.now = now;
+        (self.taken_items, self.taken_bytes) = (0, 0);
         self.classifier.refill(now);
         let lists =
             now.saturating_sub(self.last_listing) >= LIST_INTERVAL || self.last_listing == 0;
@@ -404,8 +436,19 @@ impl Tap {
         let judgement =
             self.classifier
                 .classify(&message, buffer.length, template, &mut self.records);
+        // The queue would refuse what one poll finds beyond its caps, but only after the poll.
+        let is_captured = judgement == MessageVerdict::Captured;
+        let (items, length) = match is_captured {
+            true => (1, buffer.length as usize),
+            false => (self.records.len(), 0),
+        };
+        let (items, length) = (self.taken_items + items, self.taken_bytes + length);
+        if items > InboxItems::CAP || length > InboxBytes::CAP {
+            self.refused += 1;
+            return;
+        }
         let mut bytes = Vec::new();
-        let is_whole = judgement != MessageVerdict::Captured || buffer.read(segment, &mut bytes);
+        let is_whole = !is_captured || buffer.read(segment, &mut bytes);
         if !buffer.is_valid(segment) {
             self.counters.missed += 1;
             return;
@@ -416,7 +459,8 @@ impl Tap {
             return;
         }
         self.counters.read += 1;
-        if judgement == MessageVerdict::Captured {
+        (self.taken_items, self.taken_bytes) = (items, length);
+        if is_captured {
             self.counters.captured += 1;
             // Samples that are read do not indicate a new participant.
             let may_be_new = !(self.needs_every_message && self.classifier.is_wanted);
@@ -481,9 +525,7 @@ impl Tap {
                 self.directories.find();
             }
             self.abandoned.clear();
-            if now.saturating_sub(self.last_memory_use) >= MEMORY_USE_INTERVAL
-                || self.last_memory_use == 0
-            {
+            if self.is_memory_use_due(now) {
                 self.last_memory_use = now;
                 self.counters.memory_use = self.directories.memory_use();
             }

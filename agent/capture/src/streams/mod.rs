@@ -360,8 +360,19 @@ impl Streams {
             self.evict();
         }
         if self.order.is_full() {
+            // A connection that began anew is several times in the order. Its last place counts.
+            let mut places: HashMap<StreamId, usize> = HashMap::new();
+            for id in self.order.iter() {
+                *places.entry(*id).or_default() += 1;
+            }
             let streams = &self.streams;
-            self.order.retain(|id| streams.contains_key(id));
+            self.order.retain(|id| {
+                let is_last = places.get_mut(id).is_some_and(|left| {
+                    *left -= 1;
+                    *left == 0
+                });
+                is_last && streams.contains_key(id)
+            });
         }
     }
 

@@ -177,9 +177,9 @@ impl Stream {
         !self.ahead.is_empty()
     }
 
-    /// Returns whether segments have waited too long.
+    /// Returns whether segments have waited too long. The clock may have been set back.
     pub fn has_waited(&self, now: Timestamp) -> bool {
-        !self.ahead.is_empty() && now > self.waiting_since + MISSING_BYTES_TIMEOUT
+        !self.ahead.is_empty() && now.distance(self.waiting_since) > MISSING_BYTES_TIMEOUT
     }
 
     /// Reads a chunk, or keeps it until the bytes before it have arrived.

@@ -390,6 +390,49 @@ fn ended_connections_leave_the_eviction_order_when_it_is_full() {
     assert_driven::<ZenohOrder>();
 }
 
+#[test]
+fn connections_that_begin_anew_are_rarely_removed_from_the_eviction_order() {
+    let (mut streams, mut cleanings) = (Streams::default(), 0);
+    let connections = 4000;
+    for turn in 1..=4 {
+        for port in 1..=connections {
+            let before = streams.order.len();
+            let syn = Chunk {
+                syn: true,
+                ..chunk(port, turn, &[])
+            };
+            streams.chunk(&syn, |_| {});
+            if streams.order.len() <= before {
+                cleanings += 1;
+                assert_eq!(streams.order.len(), usize::from(connections));
+                assert_eq!(streams.order.back(), Some(&syn.stream));
+            }
+        }
+    }
+    assert_eq!(streams.streams.len(), usize::from(connections));
+    assert_eq!(cleanings, 2);
+}
+
+#[test]
+fn missing_bytes_are_given_up_after_the_clock_was_set_back() {
+    let hour = 3_600_000_000_000;
+    let mut streams = Streams::default();
+    let first = Chunk {
+        time: Timestamp(2 * hour),
+        boundary: Some(Protocol::Zenoh),
+        ..chunk(1, 1, &[1, 0, 4])
+    };
+    streams.chunk(&first, |_| {});
+    let later = Chunk {
+        time: Timestamp(2 * hour),
+        ..chunk(1, 100, &[1, 0, 4])
+    };
+    streams.chunk(&later, |_| {});
+    assert_eq!(streams.counters().gaps, 0);
+    streams.advance(Timestamp(hour), |_| {});
+    assert_eq!(streams.counters().gaps, 1);
+}
+
 /// Zenoh sends such a batch in place of the rest of a message that it drops.
 #[test]
 fn an_empty_batch_is_not_a_gap_but_a_run_of_zeros_is() {

@@ -5,7 +5,9 @@
 //! The references are the nodes' logs, the kernel's own counters, and the kernel's list of attached
 //! programs.
 
+use std::fs::File;
 use std::path::Path;
+use std::process::Stdio;
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -227,6 +229,33 @@ fn a_briefly_missing_cgroup_is_reported_and_observed_again() -> Result<()> {
     ensure_nothing_attached(above.path(), 0)
 }
 
+#[test]
+fn a_cgroup_that_does_not_exist_yet_ends_the_agent_so_that_it_is_started_again() -> Result<()> {
+    let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+    let elsewhere = Namespace::isolated()?;
+    let above = Cgroup::create(&format!("{PREFIX}-{}-later", std::process::id()))?;
+    let group = above.path().join("robot");
+    let group = group.display();
+    let configuration = Configuration::new(&format!(
+        "watch: [/**]\ncapture: {{source: auto, cgroup: {group}}}\n"
+    ))?;
+    let log = configuration.directory.path().join("log");
+    let mut early = configuration.launch_with(&elsewhere, File::create(&log)?.into())?;
+    let status = early.wait(PATIENCE)?;
+    let printed = std::fs::read_to_string(&log)?;
+    // The unit does not restart an agent that ends with 77.
+    ensure!(status.code() == Some(1), "{status}: {printed}");
+    let reason = format!("cannot open the control group {group}");
+    ensure!(printed.contains(&reason), "{printed}");
+
+    let _group = above.create_below("robot")?;
+    let agent = configuration.start(&elsewhere)?;
+    let page = agent.scrape()?;
+    let host = page.value("ros2probe_capture_source_info", &[("source", "host")]);
+    ensure!(host == Some(1.0), "{}", page.0);
+    Ok(())
+}
+
 /// Removes a cgroup after its last process has ended, and waits until `noticed` is true.
 fn remove_until(cgroup: &Path, noticed: impl Fn() -> bool) -> Result<()> {
     eventually(|| Ok(std::fs::remove_dir(cgroup)?))?;
@@ -266,9 +295,15 @@ impl Configuration {
 
     /// Starts the agent without waiting for it.
     fn launch(&self, host: &Namespace) -> Result<Process> {
+        self.launch_with(host, Stdio::inherit())
+    }
+
+    /// Starts the agent as [`Configuration::launch`] does, with standard error redirected.
+    fn launch_with(&self, host: &Namespace, errors: Stdio) -> Result<Process> {
         let file = self.directory.path().join("ros2probe.yaml");
         let arguments = ["run".as_ref(), "--config".as_ref(), file.as_os_str()];
-        Process::start(&host.on_network(), env!("CARGO_BIN_EXE_rp"), arguments)
+        let program = env!("CARGO_BIN_EXE_rp");
+        Process::start_with(&host.on_network(), program, arguments, errors)
     }
 }
 

@@ -313,6 +313,60 @@ fn a_network_namespace_is_reported_while_its_path_is_missing() -> Result<()> {
 }
 
 #[test]
+fn the_namespace_of_a_process_is_reported_as_missing_only_after_its_end() -> Result<()> {
+    let link = Link::new()?;
+    let words = ["-c", "echo inside && exec sleep 1000"];
+    let mut keeper = Process::start(&link.robot.on_network(), "sh", words)?;
+    keeper.wait_for("inside", Duration::from_secs(60))?;
+    let capture = format!(
+        "watch: [/**]\ncapture: {{source: wire, network_namespaces: [/proc/{}/ns/net]}}\n",
+        keeper.pid()
+    );
+    // The agent has dropped the right to read this path.
+    let observed = Observed::start(&link.monitor, &capture)?;
+    for _ in 0..30 {
+        observed.agent.request("/readyz")?;
+        std::thread::sleep(Duration::from_millis(100));
+    }
+    let mut sender = Sender::new(&link.robot, "127.0.0.1:0", "127.0.0.1:7400")?;
+    observed.counts_each_sample_once("/inside", &mut sender)?;
+    keeper.terminate()?;
+    wait_until("missed", || Ok(observed.agent.request("/readyz").is_err()))
+}
+
+#[test]
+fn an_interface_that_never_existed_is_reported_until_it_appears() -> Result<()> {
+    let link = Link::new()?;
+    // One namespace with the interface suffices.
+    ip(&link.robot, "link add only0 type veth peer name far0")?;
+    let directory = tempfile::tempdir()?;
+    let file = directory.path().join("ros2probe.yaml");
+    let configuration = format!(
+        "watch: [/**]\ncapture:\n  source: wire\n  network_namespaces: [{}]\n  interfaces: \
+         {{include: [eth0, only0, eth9, wlan*]}}\n",
+        link.robot.network().display()
+    );
+    std::fs::write(&file, configuration)?;
+    let arguments = ["run".as_ref(), "--config".as_ref(), file.as_os_str()];
+    let program = env!("CARGO_BIN_EXE_rp");
+    let mut agent = Agent {
+        process: Process::start(&link.monitor.on_network(), program, arguments)?,
+        host: &link.monitor,
+    };
+    let wait_for = |agent: &Agent<'_>, reason: &str| {
+        wait_until(reason, || {
+            let answer = agent.request("/readyz");
+            Ok(answer.is_err_and(|error| format!("{error:#}").contains(reason)))
+        })
+    };
+    wait_for(&agent, "the interface eth9 does not exist")?;
+    add_cable(&link, "eth9", "10.107.0")?;
+    agent.wait_ready(Duration::from_secs(60))?;
+    ip(&link.monitor, "link del eth9")?;
+    wait_for(&agent, "the interface eth9 is gone")
+}
+
+#[test]
 fn fragments_in_any_order_make_one_sample() -> Result<()> {
     let link = Link::new()?;
     let observed = Observed::start(&link.monitor, WATCH_ALL)?;

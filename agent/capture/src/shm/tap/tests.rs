@@ -170,6 +170,56 @@ fn a_message_of_200_kilobytes_in_one_buffer_is_captured_whole() {
 }
 
 #[test]
+fn a_poll_takes_no_more_bytes_than_its_queue_holds() {
+    let whole = InboxBytes::CAP >> 20;
+    let mut message = sample(1);
+    message[34..36].fill(0);
+    message[44..48].copy_from_slice(&[0, 1, 0, 0xc2]);
+    message.resize(1 << 20, 0);
+    // Messages that were in the ring before it was opened count as well.
+    for is_open in [true, false] {
+        let mut host = Host::new();
+        let mut port = PortImage::new(7410, 32, 0x100).in_directory(host.path());
+        let mut segment = SegmentImage::new([1; 8], 24 << 20).in_directory(host.path());
+        if is_open {
+            host.poll_after(SECOND);
+        }
+        for _ in 0..20 {
+            port.push(segment.put(&message));
+        }
+        assert_eq!(host.find_after(MILLISECOND).len(), whole);
+        assert_eq!(host.tap.refused(), 20 - whole as u64);
+        // The next poll has room again.
+        port.push(segment.put(&sample(2)));
+        assert_eq!(host.poll_after(MILLISECOND), [2]);
+    }
+}
+
+#[test]
+fn the_use_of_memory_is_measured_while_polling_is_paused() {
+    let mut host = Host::new();
+    let (mut port, mut segment) = (host.port(7411), host.segment(1));
+    host.poll_after(SECOND);
+    host.tap.close_all();
+    let stale_bytes = |host: &mut Host, nanoseconds: u64| {
+        host.now += nanoseconds;
+        host.tap.measure_memory_use(host.now);
+        host.tap.counters().memory_use.stale_bytes
+    };
+    assert_eq!(stale_bytes(&mut host, MEMORY_USE_INTERVAL), 0);
+    let killed = host.segment(2).path(host.path());
+    let _lock = lock_of(&killed, false);
+    assert_eq!(stale_bytes(&mut host, SECOND), 0);
+    assert!(stale_bytes(&mut host, MEMORY_USE_INTERVAL) > 0);
+    fs::remove_file(killed).unwrap();
+    assert_eq!(stale_bytes(&mut host, MEMORY_USE_INTERVAL), 0);
+    // Polling continues with every port.
+    assert!(!host.tap.has_ports());
+    port.push(segment.put(&sample(1)));
+    assert_eq!(host.poll_after(MILLISECOND), [1]);
+}
+
+#[test]
 fn the_time_of_a_message_is_read_after_its_announcement() {
     let mut host = Host::new();
     let (mut port, mut segment) = (host.port(7411), host.segment(1));
