@@ -152,11 +152,13 @@ page() {
         die "no browser: put a chromium-headless-shell at /usr/bin/chromium-headless-shell"
 }
 
-# The OpenTelemetry receiver of the tests; it is linked against this version of libpython.
+# The OpenTelemetry receiver of the tests; it is linked against libpython of the interpreter's version.
 rotel() {
-    local place=$tools/rotel
+    local place=$tools/rotel version
     compgen -G "$place/lib/python3*/site-packages/rotel-0.0.1a15.dist-info" >/dev/null && return
-    packages python3-venv libpython3.11
+    packages python3 python3-venv
+    version=$(python3 -c 'import sys; print("%d.%d" % sys.version_info[:2])')
+    packages "libpython$version"
     say "installing rotel 0.0.1a15 from PyPI into target/tools/rotel"
     rm -rf "$place"
     python3 -m venv "$place"
@@ -172,9 +174,10 @@ scapy() { python_packages scapy "scapy==2.8.0"; }
 # The newest Cyclone DDS, for the peers of the interoperability matrix.
 cyclonedds() { python_packages cyclonedds "cyclonedds==11.0.1"; }
 
-# Generates requests to the control API; installed in a separate Python environment.
+# Generates requests to the control API; installed in a separate Python environment. The newest version
+# for Python 3.10, which Ubuntu 22.04 has.
 schemathesis() {
-    local place=$tools/schemathesis version=4.32.5
+    local place=$tools/schemathesis version=4.30.1
     [ "$("$place/bin/st" --version 2>/dev/null)" = "st, version $version" ] && return
     packages python3 python3-venv
     say "installing schemathesis $version into target/tools (a Python environment of its own)"
@@ -200,7 +203,8 @@ python_packages() {
 }
 
 # Validates the workflows, the action and the compose file against the schemas that this package contains.
-workflows() { python_packages workflows "check-jsonschema==0.39.0"; }
+# The newest version for Python 3.10, which Ubuntu 22.04 has.
+workflows() { python_packages workflows "check-jsonschema==0.38.2"; }
 
 # Validates the bills of materials against the schema of CycloneDX.
 bills() {

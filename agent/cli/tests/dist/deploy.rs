@@ -300,6 +300,39 @@ fn the_daemon_set_has_exactly_the_privileges_of_the_unit() -> Result<()> {
 }
 
 #[test]
+fn the_daemon_set_has_the_memory_of_the_unit() -> Result<()> {
+    let unit = std::fs::read_to_string(deploy().join("../systemd/ros2probe.service"))?;
+    let memory = unit
+        .lines()
+        .find_map(|line| line.strip_prefix("MemoryMax="));
+    // `M` of systemd is `Mi` of Kubernetes.
+    let memory = format!("{}i", memory.context("the unit has no MemoryMax")?);
+    let (pod, values) = (pod()?, yaml("helm/ros2probe/values.yaml")?);
+    for resources in [&pod["containers"][0]["resources"], &values["resources"]] {
+        ensure!(resources["limits"]["memory"] == memory, "{resources:?}");
+    }
+    Ok(())
+}
+
+#[test]
+fn kubernetes_restarts_only_an_agent_that_no_longer_captures() -> Result<()> {
+    let pod = pod()?;
+    let container = &pod["containers"][0];
+    let path = |probe: &str| container[probe]["httpGet"]["path"].clone();
+    ensure!(path("readinessProbe") == "/readyz");
+    // An agent whose interface is gone is not ready, and systemd does not restart it either.
+    ensure!(path("livenessProbe") == "/livez");
+    let startup = &container["startupProbe"];
+    ensure!(path("startupProbe") == "/readyz");
+    let seconds = startup["periodSeconds"]
+        .as_u64()
+        .zip(startup["failureThreshold"].as_u64())
+        .map(|(period, failures)| period * failures);
+    ensure!(seconds == Some(300), "{startup:?}");
+    Ok(())
+}
+
+#[test]
 fn the_configuration_of_the_daemon_set_is_valid_and_its_paths_are_mounted() -> Result<()> {
     let documents = documents("kubernetes/ros2probe.yaml")?;
     let map = documents.iter().find(|one| one["kind"] == "ConfigMap");
@@ -502,6 +535,30 @@ fn every_file_that_the_documents_link_to_exists() -> Result<()> {
         }
         ensure!(found > 0, "{document} links to nothing");
     }
+    Ok(())
+}
+
+/// Earlier, the table lacked the socket and the service of the broker.
+#[test]
+fn the_installation_by_hand_copies_every_unit_that_the_service_wants() -> Result<()> {
+    let unit = std::fs::read_to_string(deploy().join("../systemd/ros2probe.service"))?;
+    let page = std::fs::read_to_string(deploy().join("README.md"))?;
+    let wanted = unit.lines().find_map(|line| line.strip_prefix("Wants="));
+    let mut units = vec!["ros2probe.service".to_owned()];
+    for name in wanted.context("wants nothing")?.split(' ') {
+        units.push(name.to_owned());
+        // A socket starts the service of its name.
+        let activated = name.strip_suffix(".socket");
+        units.extend(activated.map(|stem| format!("{stem}.service")));
+    }
+    ensure!(units.len() > 2, "{units:?}");
+    for name in units {
+        let row = format!("| `systemd/{name}` | `/etc/systemd/system/{name}` |");
+        ensure!(page.contains(&row), "no row {row}");
+    }
+    let reload = page.find("systemctl daemon-reload");
+    let enable = page.find("systemctl enable --now ros2probe");
+    ensure!(reload.is_some() && reload < enable, "reloads too late");
     Ok(())
 }
 

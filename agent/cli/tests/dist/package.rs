@@ -155,11 +155,11 @@ fn only_the_drop_in_for_interfaces_permits_the_wire_source(
     prints(host, RUNS, "active")
 }
 
-/// Checks a service that reaches neither sockets nor interfaces.
+/// Checks a service that reaches neither sockets nor interfaces: its path is no control group.
 fn a_service_without_any_source_ends_with_the_missing_lines(host: &Debian) -> Result<()> {
     host.run(&format!(
         "cp --preserve {CONFIG} /srv/before.yaml; \
-         sed -i 's/^  # source: auto .*/  cgroup: \\/sys\\/fs\\/cgroup\\/absent/' {CONFIG}"
+         sed -i 's/^  # source: auto .*/  cgroup: \\/usr/' {CONFIG}"
     ))?;
     host.text("systemctl restart ros2probe")?;
     prints(host, EXIT, "77")?;
@@ -266,16 +266,36 @@ fn a_host_without_systemd_accepts_the_package() -> Result<()> {
     host.run(&format!("rp check-config {CONFIG}"))?;
     host.run("bash -uc '. /usr/share/bash-completion/completions/rp && complete -p rp'")?;
     serves_with_the_rights_of_the_unit(&host)?;
+    a_package_of_another_architecture_may_run_in_each_unit(&host)?;
 
     host.run(&format!("echo '# mine' >>{CONFIG}"))?;
     host.run(&format!("dpkg --force-confold --install {new}"))?;
     host.run(&format!(
         "grep -q mine {CONFIG} && test -e {CONFIG}.dpkg-dist"
     ))?;
+    // A package of the host's own architecture removes the drop-ins, as a removal does.
+    host.run("! ls /usr/lib/systemd/system | grep 'ros2probe.*\\.d$'")?;
+    a_package_of_another_architecture_may_run_in_each_unit(&host)?;
     host.run("dpkg --remove ros2probe")?;
     host.run(&format!("test -e {CONFIG} && test -d /var/lib/ros2probe"))?;
     host.run("dpkg --purge ros2probe")?;
     check_no_files(&host)
+}
+
+/// Configures the package as if it were of another architecture. Earlier, a 32-bit systemd ended the
+/// arm64 binary at its start, as its `native` is another architecture.
+fn a_package_of_another_architecture_may_run_in_each_unit(host: &Debian) -> Result<()> {
+    host.run(
+        "DPKG_MAINTSCRIPT_PACKAGE=ros2probe DPKG_MAINTSCRIPT_ARCH=another \
+         /var/lib/dpkg/info/ros2probe.postinst configure",
+    )?;
+    for unit in ["ros2probe", "ros2probe-attach", "ros2probe-ship"] {
+        host.run(&format!(
+            "grep -qx SystemCallArchitectures=arm64 \
+             /usr/lib/systemd/system/{unit}.service.d/foreign-architecture.conf"
+        ))?;
+    }
+    Ok(())
 }
 
 /// Checks that a purge leaves only the user and dpkg's own records.
@@ -443,7 +463,7 @@ fn book() -> Result<Vec<String>> {
     Ok(pages)
 }
 
-const FILES: [(&str, u32); 22] = [
+const FILES: [(&str, u32); 23] = [
     ("etc/ros2probe/ros2probe.yaml", 0o644),
     ("usr/bin/rp", 0o755),
     ("usr/lib/systemd/system/ros2probe-attach.service", 0o644),
@@ -460,6 +480,7 @@ const FILES: [(&str, u32); 22] = [
     ("usr/share/lintian/overrides/ros2probe", 0o644),
     ("usr/share/ros2probe/dashboards/fleet.json", 0o644),
     ("usr/share/ros2probe/dashboards/robot.json", 0o644),
+    ("usr/share/ros2probe/foreign-architecture.conf", 0o644),
     ("usr/share/ros2probe/interfaces.conf", 0o644),
     ("usr/share/ros2probe/ros2probe.schema.json", 0o644),
     ("usr/share/ros2probe/rules/ros2probe.alerts.yaml", 0o644),

@@ -189,3 +189,59 @@ fn the_unit_grants_exactly_the_privileges_that_the_agent_needs() {
         assert!(text.lines().any(|other| other == line), "{line}");
     }
 }
+
+/// A 32-bit systemd takes `native` for its own architecture.
+#[test]
+fn the_package_can_permit_a_foreign_architecture_in_every_service() {
+    let packaging = unit().with_file_name("../packaging");
+    let read = |name: &str| std::fs::read_to_string(packaging.join(name)).unwrap();
+    let lines = read("foreign-architecture.conf");
+    assert!(lines.ends_with("\n[Service]\nSystemCallArchitectures=arm64\n"));
+    let (install, remove) = (read("scripts/postinst"), read("scripts/postrm"));
+    let directory = tempfile::tempdir().unwrap();
+    let mut services = 0;
+    for entry in unit().parent().unwrap().read_dir().unwrap() {
+        let name = entry.unwrap().file_name().into_string().unwrap();
+        let Some(stem) = name.strip_suffix(".service") else {
+            continue;
+        };
+        let text = std::fs::read_to_string(named(&name)).unwrap();
+        assert!(
+            text.contains("\nSystemCallArchitectures=native\n"),
+            "{name}"
+        );
+        assert!(install.contains(&format!(" {name}")), "{name}");
+        assert!(remove.contains(&format!(" {stem}")), "{name}");
+        services += 1;
+        if UNITS.contains(&name.as_str()) {
+            let copy = directory.path().join(&name);
+            let run = text.replace("/usr/bin/rp", env!("CARGO_BIN_EXE_rp"));
+            std::fs::write(&copy, format!("{run}\n{lines}")).unwrap();
+            accepts(&copy);
+        }
+    }
+    assert_eq!(services, 3);
+}
+
+/// systemd before 247 ignores `LoadCredential=`: without its file, the agent does not start.
+#[test]
+fn each_document_with_a_credential_names_the_file_for_an_older_systemd() {
+    let root = unit().with_file_name("..");
+    for document in ["systemd/ros2probe.service", "docs/security.md"] {
+        let text = std::fs::read_to_string(root.join(document)).unwrap();
+        let (_, after) = text.split_once("LoadCredential=").expect(document);
+        assert!(after.contains("systemd before 247"), "{document}");
+    }
+    for document in ["docs/foxglove.md", "docs/security.md"] {
+        let text = std::fs::read_to_string(root.join(document)).unwrap();
+        let (_, after) = text.split_once("/run/credentials/").expect(document);
+        assert!(after.contains("(install-jetson.md"), "{document}");
+    }
+    let page = std::fs::read_to_string(root.join("docs/install-jetson.md")).unwrap();
+    for part in [
+        "token_file: /etc/ros2probe/token",
+        "install -m 0640 -o root -g ros2probe",
+    ] {
+        assert!(page.contains(part), "{part}");
+    }
+}
