@@ -24,7 +24,7 @@ use std::time::Duration;
 use foldhash::HashMap;
 use ros2probe_wire::discovery::{EndpointAnnouncement, ParticipantAnnouncement};
 use ros2probe_wire::names::DdsTopic;
-use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, SequenceNumber};
+use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, RtpsDuration, SequenceNumber};
 
 use crate::facts::bounded::TableFacts;
 use crate::facts::bounded::{Bounded, Counted, Sum};
@@ -272,12 +272,12 @@ impl Discovery {
             return;
         }
         let (domain_id, source) = domain(announcement, origin);
-        let relayed = origin.sender != guid.prefix;
+        let relayer = (origin.sender != guid.prefix).then_some(origin.sender);
         let proxy = ParticipantProxy::of(announcement);
         if let Some(participant) = self.participants.get_mut(&guid.prefix) {
             participant.seen(origin.at);
-            if participant.relayed && !relayed {
-                participant.relayed = false;
+            if participant.relayer.is_some() && participant.relayer != relayer {
+                participant.relayer = relayer;
                 self.revision += 1;
             }
             let addresses = Addresses::of(announcement);
@@ -313,7 +313,7 @@ impl Discovery {
             watched: 0,
             local: false,
             came_by_tcp: false,
-            relayed,
+            relayer,
             sends: false,
             domain_source: source,
             nodes_from: None,
@@ -335,8 +335,17 @@ impl Discovery {
     pub fn next_expiry(&self) -> Option<ModelTime> {
         let participants = self.participants.values();
         participants
-            .filter_map(|participant| participant.lease_end())
+            .filter_map(|participant| self.lease_end(participant))
             .min()
+    }
+
+    /// Returns the end of a participant's lease. A server that others relay may be gone as well, so
+    /// it keeps no participant.
+    fn lease_end(&self, participant: &Participant) -> Option<ModelTime> {
+        let is_direct = |relayer: &Participant| relayer.relayer.is_none();
+        let relayer = participant.relayer.as_ref();
+        let relayer = relayer.and_then(|prefix| self.participants.get(prefix));
+        participant.lease_end(relayer.is_some_and(|relayer| is_direct(relayer)))
     }
 
     /// Removes participants whose lease has expired at `now`.
@@ -344,7 +353,7 @@ impl Discovery {
         let mut expired: Vec<_> = self
             .participants
             .iter()
-            .filter_map(|(prefix, participant)| Some((participant.lease_end()?, *prefix)))
+            .filter_map(|(prefix, participant)| Some((self.lease_end(participant)?, *prefix)))
             .filter(|(end, _)| *end <= now)
             .collect();
         expired.sort_unstable();
@@ -403,6 +412,7 @@ impl Discovery {
         let Some(participant) = self.participants.remove(&prefix) else {
             return;
         };
+        self.end_leases_of_relayed(prefix, at);
         let domain_id = participant.domain_id;
         let guid = Guid::new(prefix, EntityId::PARTICIPANT);
         if let Some(event) = event {
@@ -419,6 +429,19 @@ impl Discovery {
             for node in participant.nodes {
                 let entity = DiscoveredEntity::node(domain_id, guid, &node.name);
                 self.note(&entity, event, at, journal);
+            }
+        }
+    }
+
+    /// Begins the leases of participants that a removed one relayed, and limits those without an
+    /// end: their server no longer disposes of them.
+    fn end_leases_of_relayed(&mut self, relayer: GuidPrefix, at: ModelTime) {
+        for participant in self.participants.values_mut() {
+            if participant.relayer == Some(relayer) {
+                participant.last_seen = participant.last_seen.max(at);
+                if participant.proxy.lease == RtpsDuration::Infinite {
+                    participant.restored = participant.restored.max(Some(at));
+                }
             }
         }
     }

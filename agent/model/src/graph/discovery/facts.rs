@@ -121,7 +121,7 @@ pub struct Participant {
     pub proxy: ParticipantProxy,
     /// Unicast addresses.
     pub addresses: Addresses,
-    /// Time of restoration from saved state, until its first packet.
+    /// Time of restoration from saved state, or of the end of its relayer, until its first packet.
     pub restored: Option<ModelTime>,
     /// Its domain.
     pub domain_id: DomainId,
@@ -139,8 +139,9 @@ pub struct Participant {
     pub(crate) local: bool,
     /// Whether one of its messages came by TCP.
     pub(super) came_by_tcp: bool,
-    /// Whether only others have announced it, such as a Discovery Server.
-    pub(super) relayed: bool,
+    /// Participant that relayed its last announcement, if only others have announced it: a
+    /// Discovery Server.
+    pub(super) relayer: Option<GuidPrefix>,
     /// Whether it has sent user data.
     pub(super) sends: bool,
     pub(super) domain_source: DomainSource,
@@ -249,10 +250,11 @@ impl Participant {
     }
 
     /// Returns the end of its lease if no further packet arrives; `None` means never. A Discovery
-    /// Server relays an announcement once, and disposes of the participant when its lease ends.
-    pub(super) fn lease_end(&self) -> Option<ModelTime> {
+    /// Server relays an announcement once, and disposes of the participant when its lease ends: the
+    /// lease does not count while the server exists (`is_kept`).
+    pub(super) fn lease_end(&self, is_kept: bool) -> Option<ModelTime> {
         let lease = match self.proxy.lease {
-            RtpsDuration::Finite(lease) if !self.relayed => lease,
+            RtpsDuration::Finite(lease) if !is_kept => lease,
             // The participant may have stopped while no agent ran, so a lease without an end is
             // limited.
             _ => self.restored.map(|_| MAX_SILENCE)?,

@@ -58,9 +58,9 @@ pub struct Remembered {
     tcp: bool,
     #[serde(default)]
     announces_by_tcp: bool,
-    /// Whether only others have announced it; older agents did not save it.
-    #[serde(default)]
-    relayed: bool,
+    /// GUID prefix of the participant that relayed it; older agents did not save it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    relayer: Option<String>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     product_version: Option<String>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -218,7 +218,7 @@ impl Remembered {
             shared_memory: proxy.shared_memory,
             tcp: proxy.tcp,
             announces_by_tcp: proxy.announces_by_tcp,
-            relayed: participant.relayed,
+            relayer: participant.relayer.map(|prefix| prefix.to_string()),
             product_version: text(&proxy.product_version),
             machine_id: text(&proxy.machine_id),
             addresses: participant.addresses.clone(),
@@ -271,7 +271,9 @@ impl Remembered {
             watched: 0,
             local: false,
             came_by_tcp: false,
-            relayed: self.relayed,
+            relayer: (self.relayer.as_deref())
+                .and_then(hexadecimal)
+                .map(GuidPrefix),
             sends: false,
             domain_source: self.domain_source,
             nodes_from: nodes_from.and_then(|(writer, number)| {
