@@ -1,5 +1,6 @@
 //! Start and end of connections, with the tokens and sessions that end with them.
 
+use std::collections::BTreeSet;
 use std::time::Duration;
 
 use foldhash::HashMap;
@@ -133,13 +134,20 @@ impl Zenoh {
     pub fn end_expired(&mut self, is_known: impl Fn(ZenohId) -> bool) {
         let sessions = self.graph.sessions();
         let unknown: Vec<_> = sessions.filter(|session| !is_known(*session)).collect();
+        if unknown.is_empty() {
+            return;
+        }
+        let directions = self.directions.iter();
+        let open = directions.filter(|(stream, direction)| self.is_open(stream, direction));
+        let (numbers, connected): (BTreeSet<_>, BTreeSet<_>) = open
+            .map(|(_, direction)| (direction.number, direction.session()))
+            .unzip();
+        let (senders, _) = self.remembered.parts();
+        let remembered: BTreeSet<_> = senders.values().map(|side| side.zid).collect();
         for session in unknown {
             let declarers = self.graph.declarers(session);
-            let mut directions = self.directions.iter();
-            let is_declared = directions.any(|(stream, direction)| {
-                declarers.contains(&direction.number) && self.is_open(stream, direction)
-            });
-            if !is_declared && !self.has_connection(session) {
+            let is_open = connected.contains(&Some(session)) || remembered.contains(&session);
+            if !is_open && declarers.is_disjoint(&numbers) {
                 self.graph.end(session);
                 self.revision += 1;
             }
