@@ -194,7 +194,7 @@ fn announce_existing_endpoint(
             (*figures).announced = MAX_NAME_ATTEMPTS;
         } else if outcome == Outcome::RingFull {
             // The name was not read, so the attempt does not count.
-            (*figures).announced -= 1;
+            (*figures).announced = (*figures).announced.saturating_sub(1);
         }
     }
 }

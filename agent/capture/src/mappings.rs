@@ -5,10 +5,12 @@
 //! reading them needs no privilege, and changes nothing in the processes. Processes are identified
 //! as in the broker's PID namespace.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
+use std::ffi::OsString;
 use std::fs;
 use std::io;
 use std::os::fd::{AsFd, AsRawFd as _, BorrowedFd, OwnedFd};
+use std::os::unix::fs::MetadataExt as _;
 use std::ptr::{self, NonNull};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
@@ -36,6 +38,8 @@ const MAX_RECORD: usize = u16::MAX as usize;
 
 /// File that lists the CPUs in use.
 const ONLINE_PATH: &str = "/sys/devices/system/cpu/online";
+/// Directory of all CPUs, with a directory `topology` for each one in use.
+const CPUS_PATH: &str = "/sys/devices/system/cpu";
 /// Time since the start of the machine, with its suspensions.
 const UPTIME_PATH: &str = "/proc/uptime";
 /// Pause between two comparisons of the CPUs.
@@ -60,6 +64,8 @@ struct Cpus {
     online: String,
     /// Time for which the machine was suspended; `None` if it is not known.
     suspended: Option<Duration>,
+    /// Inode of a directory that the kernel creates again whenever the CPU comes, for each CPU.
+    arrivals: BTreeMap<OsString, u64>,
 }
 
 impl Cpus {
@@ -67,6 +73,7 @@ impl Cpus {
         Self {
             online: fs::read_to_string(ONLINE_PATH).unwrap_or_default(),
             suspended: suspended(),
+            arrivals: arrivals(),
         }
     }
 
@@ -74,7 +81,7 @@ impl Cpus {
     fn are_same(&self, now: &Self) -> bool {
         let times = self.suspended.zip(now.suspended);
         let was_suspended = times.is_some_and(|(then, now)| now >= then + MIN_SUSPENSION);
-        self.online == now.online && !was_suspended
+        (&self.online, &self.arrivals) == (&now.online, &now.arrivals) && !was_suspended
     }
 }
 
@@ -127,7 +134,9 @@ impl MappingEvents {
             return false;
         }
         self.checked = Instant::now();
-        !self.opened.are_same(&Cpus::read())
+        let now = Cpus::read();
+        self.opened.suspended = self.opened.suspended.or(now.suspended);
+        !self.opened.are_same(&now)
     }
 
     /// Opens the rings for the configuration key `key`. Without them, the thread of that key finds
@@ -271,6 +280,15 @@ fn suspended() -> Option<Duration> {
     (spent < MAX_READING).then(|| uptime.saturating_sub(Duration::from_nanos(before)))
 }
 
+fn arrivals() -> BTreeMap<OsString, u64> {
+    let entries = fs::read_dir(CPUS_PATH).into_iter().flatten().flatten();
+    let arrivals = entries.filter_map(|entry| {
+        let topology = fs::metadata(entry.path().join("topology")).ok()?;
+        Some((entry.file_name(), topology.ino()))
+    });
+    arrivals.collect()
+}
+
 /// Returns the process of a record, if the mapped file is of interest.
 fn process(record: &[u8], is_library: impl Fn(&str) -> bool) -> Option<u32> {
     let process = record.get(8..12)?.try_into().ok().map(u32::from_ne_bytes)?;
@@ -307,6 +325,7 @@ mod tests {
         let at = |online: &str, suspended: Option<Duration>| Cpus {
             online: online.to_owned(),
             suspended,
+            arrivals: BTreeMap::from([("cpu3".into(), 7)]),
         };
         let known = Some(Duration::from_secs(7));
         let opened = at("0-3\n", known);
@@ -315,6 +334,11 @@ mod tests {
         assert!(opened.are_same(&at("0-3\n", Some(Duration::from_millis(7_020)))));
         assert!(!opened.are_same(&at("0-2\n", known)));
         assert!(!opened.are_same(&at("0-3\n", Some(Duration::from_secs(8)))));
+        // The CPU went and came again since the last look.
+        let mut again = opened.clone();
+        again.arrivals.insert("cpu3".into(), 8);
+        assert!(!opened.are_same(&again));
+        assert!(!now.arrivals.is_empty());
 
         let events = |opened: &Cpus| {
             Some(MappingEvents {

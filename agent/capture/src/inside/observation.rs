@@ -82,12 +82,14 @@ impl Probes {
         }
     }
 
-    /// Detaches from installed libraries that were written, and returns whether any waits for new
-    /// probes.
-    fn detach_written(&mut self, now: Instant) -> bool {
-        let on_demand = self.on_demand.as_mut();
-        let waits = on_demand.is_some_and(|on_demand| on_demand.detach_written(now));
-        self.lasting.detach_written(now) || waits
+    /// Detaches from libraries whose files have changed. Returns whether a probe was detached, or
+    /// waits for its installed library.
+    fn detach_changed(&mut self, now: Instant) -> bool {
+        let all = [Some(&mut self.lasting), self.on_demand.as_mut()];
+        let all = all.into_iter().flatten();
+        let changed = all.filter_map(|probes| probes.detach_changed(now).then_some(()));
+        let is_any = changed.count() > 0;
+        is_any || self.lasting.is_search_due(now)
     }
 
     /// Returns whether the lasting probes are attached, which are also at calls if none is on demand.
@@ -166,6 +168,8 @@ struct Observation {
     last_review: Instant,
     /// Whether the broker did not answer the last request: it may start later than this process.
     is_broker_unavailable: bool,
+    /// Whether processes may have started unnoticed, until all were inspected and events are open.
+    has_lost_events: bool,
 }
 
 impl Observation {
@@ -187,6 +191,7 @@ impl Observation {
             last_round: now,
             last_review: now,
             is_broker_unavailable: false,
+            has_lost_events: false,
         }
     }
 
@@ -215,11 +220,10 @@ impl Observation {
         // A late round is skipped, so the observation ends only when its last round can be
         // reported.
         let ends = !shared.is_wanted() && !shared.is_late();
-        self.probes.detach_written(now);
-        // Processes may have started while events were lost.
-        let has_lost_events = MappingEvents::drop_stale(&mut self.mappings);
+        self.probes.detach_changed(now);
+        self.has_lost_events |= MappingEvents::drop_stale(&mut self.mappings);
         let to_calls = !ends && self.suspended_at.is_none();
-        let failed = self.find(now, to_calls, has_lost_events);
+        let failed = self.find(now, to_calls);
         if ends {
             self.probes.detach();
         }
@@ -240,11 +244,12 @@ impl Observation {
         self.wait(shared, now + REPORT_INTERVAL);
     }
 
-    /// Finds processes and attaches to their libraries. With `all`, inspects processes that did not
-    /// use the library so far. Returns the error if the broker did not answer.
-    fn find(&mut self, now: Instant, to_calls: bool, all: bool) -> Option<String> {
+    /// Finds processes and attaches to their libraries. Returns the error if the broker did not
+    /// answer.
+    fn find(&mut self, now: Instant, to_calls: bool) -> Option<String> {
         let broker = &mut self.broker;
-        let found = self.processes.find(all, broker);
+        // Processes may have started while events were lost.
+        let found = self.processes.find(self.has_lost_events, broker);
         let failed = found.err().map(|error| in_words(&error));
         if failed.is_none() {
             if self.mappings.is_none() {
@@ -254,6 +259,7 @@ impl Observation {
                     &mut self.without_mappings,
                 );
             }
+            self.has_lost_events &= self.mappings.is_none();
             self.probes.install(to_calls, now, broker);
         }
         self.probes.follow(&self.processes, to_calls, now, broker);
@@ -307,14 +313,16 @@ impl Observation {
         let now = Instant::now();
         let interval = match self.is_broker_unavailable {
             true => RETRY_DELAY,
+            false if self.has_lost_events => RETRY_DELAY,
             false if self.table.len() >= MANY_PROCESSES => SHORT_REVIEW_INTERVAL,
             false => REVIEW_INTERVAL,
         };
         let is_due = now - self.last_review >= interval;
-        let has_lost_events = MappingEvents::drop_stale(&mut self.mappings);
-        if self.probes.detach_written(now) || has_lost_events || is_due {
+        let has_stale_events = MappingEvents::drop_stale(&mut self.mappings);
+        self.has_lost_events |= has_stale_events;
+        if self.probes.detach_changed(now) || has_stale_events || is_due {
             self.last_review = now;
-            let failed = self.find(now, false, has_lost_events);
+            let failed = self.find(now, false);
             let clocks = Clocks::read();
             (self.table).forget_ended(&mut self.tables, &clocks, &mut self.broker);
             self.report(shared, failed);

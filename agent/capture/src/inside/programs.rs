@@ -50,6 +50,8 @@ const FOLLOWED_STATES: usize =
     (2 * (size_of::<Blocked>() + size_of::<Activity>()) + size_of::<Handoff>()) / 8;
 /// The first word of a followed thread that can run and does not.
 const RUNNABLE: u64 = 1;
+/// Number of comparisons in a row after which a wrong number of runnable threads is corrected.
+const WRONG_COMPARISONS: u32 = 5;
 /// Tracepoints of the scheduler. The programs have the same names.
 const SCHEDULER_EVENTS: [&CStr; 2] = [c"sched_switch", c"sched_waking"];
 const _: () = assert!(size_of::<Figures>().is_multiple_of(8));
@@ -81,8 +83,8 @@ pub struct Tables {
     followed: HashMap<MapData, u32, FollowedWords>,
     /// Number of these threads that can run and do not.
     runnable: Array<MapData, i64>,
-    /// Whether that number was wrong at the last comparison.
-    was_runnable_wrong: bool,
+    /// Number of comparisons in a row at which that number was wrong.
+    wrong_runnable: u32,
 }
 
 /// The probes in one library; dropping the value removes the breakpoints.
@@ -134,7 +136,7 @@ pub fn load(
         bounds: take(ebpf, "BOUNDS")?,
         followed: take(ebpf, "FOLLOWED_THREADS")?,
         runnable: take(ebpf, "RUNNABLE_THREADS")?,
-        was_runnable_wrong: false,
+        wrong_runnable: 0,
     };
     let programs = Programs {
         breakpoints,
@@ -404,7 +406,8 @@ impl Tables {
 
     /// Corrects the number of followed threads that can run and do not. A thread that the full table
     /// drops stays in that number, and then the programs store all switches of all threads. The
-    /// number is wrong if two calls in a row find no such thread.
+    /// number is wrong if [`WRONG_COMPARISONS`] calls in a row find no such thread: one may run before
+    /// its row is read.
     ///
     /// # Errors
     /// Fails if the kernel refuses the lookup or the update.
@@ -413,12 +416,14 @@ impl Tables {
         let number = number.map_err(failed("RUNNABLE_THREADS", "read"))?;
         let is_runnable = |(_, [state, ..]): (u32, FollowedWords)| state == RUNNABLE;
         let is_any = || self.followed.iter().filter_map(Result::ok).any(is_runnable);
-        let is_wrong = number != 0 && !is_any();
-        if is_wrong && self.was_runnable_wrong {
+        let is_same = || self.runnable.get(&0, 0).is_ok_and(|now| now == number);
+        let is_wrong = number != 0 && !is_any() && is_same();
+        self.wrong_runnable = if is_wrong { self.wrong_runnable + 1 } else { 0 };
+        if self.wrong_runnable >= WRONG_COMPARISONS {
+            self.wrong_runnable = 0;
             let set = self.runnable.set(0, 0, 0);
             set.map_err(failed("RUNNABLE_THREADS", "set"))?;
         }
-        self.was_runnable_wrong = is_wrong && !self.was_runnable_wrong;
         Ok(())
     }
 
@@ -482,12 +487,14 @@ mod tests {
     }
 
     #[test]
-    fn a_number_of_runnable_threads_without_such_a_thread_is_corrected_in_the_second_round() {
+    fn a_number_of_runnable_threads_without_such_a_thread_is_corrected_after_some_rounds() {
         let (_programs, mut tables) = loaded();
         for number in [2, -1] {
             tables.runnable.set(0, number, 0).unwrap();
-            tables.correct_runnable().unwrap();
-            assert_eq!(runnable(&tables), number);
+            for _ in 1..WRONG_COMPARISONS {
+                tables.correct_runnable().unwrap();
+                assert_eq!(runnable(&tables), number);
+            }
             tables.correct_runnable().unwrap();
             assert_eq!(runnable(&tables), 0);
         }
@@ -495,7 +502,7 @@ mod tests {
         thread[0] = RUNNABLE;
         tables.followed.insert(1, thread, 0).unwrap();
         tables.runnable.set(0, 1, 0).unwrap();
-        for _ in 0..3 {
+        for _ in 0..2 * WRONG_COMPARISONS {
             tables.correct_runnable().unwrap();
             assert_eq!(runnable(&tables), 1);
         }

@@ -31,17 +31,22 @@ const LONGEST_RETRY_DELAY: Duration = Duration::from_secs(320);
 /// Time of failed attempts after which the other libraries wait for the next call. The broker may
 /// need seconds for each refusal.
 const FAILURE_TIME: Duration = Duration::from_secs(2);
-/// Time without a change after which a file that was written gets a probe again.
+/// Time without a change after which a file that changed gets a probe again.
 const SETTLING_TIME: Duration = Duration::from_secs(1);
+/// Time after a change in which installed libraries are searched again: a copy may take long, and
+/// a package manager removes a library some seconds before it installs the next one.
+const UPGRADE_TIME: Duration = Duration::from_secs(60);
 /// Why a library has no probe in that time.
-const WRITTEN: &str = "the file of the library was written";
+const CHANGED: &str = "the file of the library has changed";
 /// All known libraries, with a probe `P` in each.
 pub struct Attachments<P> {
     attach: Attach<P>,
     meaning: &'static str,
     libraries: Bounded<Libraries, BTreeMap<LibraryId, Known<P>>>,
-    /// Whether installed libraries have been attached in advance.
-    is_installed: bool,
+    /// Time of the next search for installed libraries; `None` if all are attached.
+    next_search: Option<Instant>,
+    /// Time until which the search is repeated.
+    searched_until: Instant,
 }
 
 /// Function that lets the broker attach a probe to a library.
@@ -55,9 +60,11 @@ struct Known<P> {
     /// Time after which another attempt is made, and the pause before it.
     retried: Instant,
     pause: Duration,
-    /// Version of a file whose probe was attached before any process used the library, and is
-    /// kept; `None` if a process uses or used it.
-    installed: Option<Version>,
+    /// Version of the file when the probe was attached; `None` if the path leads to another file
+    /// here.
+    version: Option<Version>,
+    /// Whether the probe was attached before any process used the library, and is kept.
+    is_installed: bool,
 }
 
 /// Attributes of a file that change when it is written, or replaced by another one.
@@ -112,7 +119,8 @@ impl<P> Attachments<P> {
             attach,
             meaning,
             libraries: Bounded::default(),
-            is_installed: false,
+            next_search: Some(Instant::now()),
+            searched_until: Instant::now(),
         }
     }
 
@@ -125,64 +133,77 @@ impl<P> Attachments<P> {
     /// Detaches from all libraries.
     pub fn clear(&mut self) {
         self.libraries.clear();
-        self.is_installed = false;
+        self.next_search = Some(Instant::now());
     }
 
     /// Returns whether installed libraries have been attached in advance.
     #[must_use]
     pub const fn is_installed(&self) -> bool {
-        self.is_installed
+        self.next_search.is_none()
     }
 
-    /// Detaches from installed libraries whose files were written in place: their functions may
-    /// have moved, and a breakpoint elsewhere can crash a process. [`Self::install`] and
-    /// [`Self::follow`] attach again a second after the last change. Returns whether any waits.
-    pub fn detach_written(&mut self, now: Instant) -> bool {
-        let mut waits = false;
+    /// Returns whether [`Self::install`] would search for installed libraries.
+    #[must_use]
+    pub fn is_search_due(&self, now: Instant) -> bool {
+        self.next_search.is_some_and(|due| now >= due)
+    }
+
+    /// Detaches from libraries whose files have changed: their functions may have moved, and a
+    /// breakpoint elsewhere can crash a process. [`Self::install`] and [`Self::follow`] attach again
+    /// a second after the last change. Returns whether a probe was detached.
+    pub fn detach_changed(&mut self, now: Instant) -> bool {
+        let (mut detached, mut is_any_installed) = (false, false);
         for library in self.libraries.values_mut() {
-            let Some(known) = library.installed else {
+            let Some(known) = library.version else {
                 continue;
             };
-            match Version::of(&library.path) {
-                Some(version) if version == known => {}
-                Some(version) if version.file == known.file => {
-                    let path = library.path.display();
-                    tracing::warn!(library = %path, "uprobe detached: the library was written");
-                    library.probe = Err(Reason(WRITTEN.to_owned()));
-                    library.retried = now + SETTLING_TIME;
-                    library.installed = Some(version);
-                }
-                // Processes may still use the old file, which does not change.
-                _ => {
-                    library.installed = None;
-                    library.used = now;
-                    waits = true;
-                }
+            let version = Version::of(&library.path);
+            if version == Some(known) {
+                continue;
             }
-            waits |= library.installed.is_some() && library.probe.is_err();
+            is_any_installed |= library.is_installed;
+            library.version = version.filter(|version| version.file == known.file);
+            if library.version.is_none() {
+                // Processes may still use the old file, which does not change.
+                library.is_installed = false;
+                library.used = now;
+                continue;
+            }
+            if library.probe.is_ok() {
+                let path = library.path.display();
+                tracing::warn!(library = %path, "uprobe detached: the library's file has changed");
+                detached = true;
+            }
+            library.probe = Err(Reason(CHANGED.to_owned()));
+            library.retried = now + SETTLING_TIME;
         }
-        if waits {
-            self.is_installed = false;
+        if is_any_installed {
+            self.next_search = Some(now + SETTLING_TIME);
+            self.searched_until = now + UPGRADE_TIME;
         }
-        waits
+        detached
     }
 
-    /// Attaches to installed libraries that no process uses yet, once after the creation and after
-    /// each [`Self::clear`]. Without an answer of the broker, the next call tries again.
+    /// Attaches to installed libraries that no process uses yet: once after the creation and after
+    /// each [`Self::clear`], and repeatedly after a change. Without an answer of the broker, the next
+    /// call tries again.
     pub fn install(&mut self, library: Library, now: Instant, broker: &mut Broker) {
-        if self.is_installed {
-            return;
+        if self.is_search_due(now) {
+            self.attach_in_advance(installed(library), now, broker);
         }
-        self.is_installed = true;
-        for path in installed(library) {
+    }
+
+    fn attach_in_advance(&mut self, paths: Vec<PathBuf>, now: Instant, broker: &mut Broker) {
+        self.next_search = (now < self.searched_until).then(|| now + RETRY_DELAY);
+        for path in paths {
             // The version is read first, so that a change in the meantime is noticed.
             let (Some(version), Ok(id)) = (Version::of(&path), id_as_mapped(&path)) else {
                 continue;
             };
             match self.libraries.get(&id) {
-                Some(known) if known.installed.is_none() || known.probe.is_ok() => continue,
+                Some(known) if !known.is_installed || known.probe.is_ok() => continue,
                 Some(known) if now < known.retried => {
-                    self.is_installed = false;
+                    self.next_search = Some(known.retried);
                     continue;
                 }
                 None if self.libraries.is_full() => continue,
@@ -198,18 +219,24 @@ impl<P> Attachments<P> {
                         used: now,
                         retried: now,
                         pause: RETRY_DELAY,
-                        installed: Some(version),
+                        version: Some(version),
+                        is_installed: true,
                     };
                     self.libraries.insert(id, library);
                 }
                 // The refusal is reported when a process uses the library.
-                Err(Refusal::Broker(BrokerError::Refused(_)) | Refusal::Program(_)) => {
-                    self.libraries.remove(&id);
-                }
+                Err(Refusal::Broker(BrokerError::Refused(_)) | Refusal::Program(_)) => {}
                 Err(Refusal::Broker(_)) => {
-                    self.is_installed = false;
+                    self.next_search = Some(now);
                     return;
                 }
+            }
+        }
+        for library in self.libraries.values_mut() {
+            // The library was refused, or it is no longer among the installed ones.
+            if library.is_installed && library.probe.is_err() && now >= library.retried {
+                library.is_installed = false;
+                library.used = now;
             }
         }
     }
@@ -242,7 +269,7 @@ impl<P> Attachments<P> {
         }
         let now = now + began.elapsed();
         self.libraries.retain(|_, library| {
-            let is_used = library.installed.is_some() || now - library.used < DETACH_DELAY;
+            let is_used = library.is_installed || now - library.used < DETACH_DELAY;
             if !is_used && library.probe.is_ok() {
                 let library = library.path.display();
                 tracing::info!(%library, "uprobe detached: the library is no longer in use");
@@ -269,7 +296,11 @@ impl<P> Attachments<P> {
             return Duration::ZERO;
         }
         let (earlier, processes) = known.map(|known| (known.pause, known.processes)).unzip();
-        let installed = known.and_then(|known| Some((known.path.clone(), known.installed?)));
+        // In the process's file system, the path may lead to another file.
+        let installed = known.filter(|known| known.is_installed);
+        let is_installed = installed.is_some();
+        let path = installed.map_or(path, |known| &known.path).clone();
+        let version = Version::of(&path).filter(|version| version.file.1 == id.inode);
         let began = Instant::now();
         let place = Place::Mapped {
             process,
@@ -297,11 +328,6 @@ impl<P> Attachments<P> {
             Ok(_) => Duration::ZERO,
             Err(_) => spent,
         };
-        // In the process's file system, the path may name another file.
-        let (path, installed) = match installed {
-            Some((path, version)) => (path, Some(version)),
-            None => (path.clone(), None),
-        };
         let library = Known {
             path,
             probe,
@@ -309,7 +335,8 @@ impl<P> Attachments<P> {
             used: now,
             retried: now + spent + pause,
             pause,
-            installed,
+            version,
+            is_installed,
         };
         self.libraries.insert(id.clone(), library);
         failed
@@ -400,10 +427,11 @@ mod tests {
             used: now,
             retried: now,
             pause: RETRY_DELAY,
-            installed: Version::of(path),
+            version: Version::of(path),
+            is_installed: true,
         };
         attachments.libraries.insert(id(1), library);
-        attachments.is_installed = true;
+        attachments.next_search = None;
         (attachments, attempts)
     }
 
@@ -419,35 +447,34 @@ mod tests {
         let (mut attachments, attempts) = with_installed(&path);
         let (processes, broker) = (processes(1), &mut Broker::here());
         let start = Instant::now();
-        assert!(!attachments.detach_written(start));
+        assert!(!attachments.detach_changed(start));
         assert!(is_attached(&attachments) && attachments.is_installed());
 
         let probes = Arc::strong_count(&attempts);
         for (text, tenths) in [("sec", 0), ("second", 5)] {
             fs::write(&path, text).unwrap();
             let now = start + Duration::from_millis(100 * tenths);
-            assert!(attachments.detach_written(now));
+            assert_eq!(attachments.detach_changed(now), tenths == 0);
             assert!(!is_attached(&attachments) && !attachments.is_installed());
             assert_eq!(Arc::strong_count(&attempts), probes - 1, "detached");
             attachments.follow(&processes, now, broker);
         }
         let nearly = start + Duration::from_millis(1400);
-        assert!(attachments.detach_written(nearly), "it waits");
+        assert!(!attachments.detach_changed(nearly) && !attachments.is_search_due(nearly));
         attachments.follow(&processes, nearly, broker);
         assert_eq!(attempts.load(Ordering::Relaxed), 0);
         let [facts] = &attachments.facts()[..] else {
             panic!("one library");
         };
-        assert_eq!(facts.refused.as_deref(), Some(WRITTEN));
+        assert_eq!(facts.refused.as_deref(), Some(CHANGED));
 
         let later = start + Duration::from_millis(1500);
+        assert!(attachments.is_search_due(later));
         attachments.follow(&processes, later, broker);
         assert_eq!(attempts.load(Ordering::Relaxed), 1);
         assert!(is_attached(&attachments));
         // The library stays an installed one.
-        fs::write(&path, "third version").unwrap();
-        assert!(attachments.detach_written(later));
-        assert!(!is_attached(&attachments));
+        assert!(attachments.libraries[&id(1)].is_installed);
     }
 
     #[test]
@@ -460,16 +487,85 @@ mod tests {
         fs::write(&new, "second").unwrap();
         fs::rename(new, &path).unwrap();
         let start = Instant::now();
-        assert!(
-            attachments.detach_written(start),
-            "the new file has no probe"
-        );
+        assert!(!attachments.detach_changed(start));
         assert!(is_attached(&attachments) && !attachments.is_installed());
+        assert!(attachments.is_search_due(start + SETTLING_TIME));
         let (nobody, broker) = (processes(0), &mut Broker::here());
         attachments.follow(&nobody, start, broker);
         assert!(is_attached(&attachments));
         attachments.follow(&nobody, start + DETACH_DELAY, broker);
         assert!(attachments.probe(&id(1)).is_none());
+    }
+
+    #[test]
+    fn a_changed_library_that_is_refused_is_tried_for_a_minute_and_then_forgotten() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("libtracetools.so");
+        fs::write(&path, "half").unwrap();
+        let (mut attachments, attempts) = refused(Duration::ZERO);
+        let broker = &mut Broker::here();
+        let start = Instant::now();
+        attachments.attach_in_advance(vec![path.clone()], start, broker);
+        assert_eq!(attempts.load(Ordering::Relaxed), 1);
+        assert!(
+            attachments.is_installed(),
+            "a refusal at the start is final"
+        );
+
+        let library = Known {
+            path: path.clone(),
+            probe: Err(Reason(CHANGED.to_owned())),
+            processes: 0,
+            used: start,
+            retried: start,
+            pause: RETRY_DELAY,
+            version: None,
+            is_installed: true,
+        };
+        attachments.libraries.insert(id(1), library);
+        attachments.next_search = Some(start);
+        attachments.searched_until = start + UPGRADE_TIME;
+        let mut searches = 0;
+        for second in 0..600 {
+            let now = start + Duration::from_secs(second);
+            if attachments.is_search_due(now) {
+                attachments.attach_in_advance(vec![path.clone()], now, broker);
+                searches += 1;
+            }
+            attachments.follow(&processes(0), now, broker);
+        }
+        assert_eq!(searches, 13);
+        assert!(attachments.is_installed());
+        assert!(attachments.libraries.is_empty());
+    }
+
+    #[test]
+    fn a_library_in_use_is_left_when_its_file_changes_and_one_of_another_root_is_not_watched() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("libtracetools.so");
+        fs::write(&path, "first").unwrap();
+        let (mut attachments, _) = with_installed(&path);
+        let inode = fs::metadata(&path).unwrap().ino();
+        let of_process = |inode| {
+            let library = Mapped {
+                id: id(inode),
+                path: path.clone(),
+                range: String::new(),
+            };
+            let used = mapped::Use {
+                libraries: vec![library],
+                shares: false,
+            };
+            Processes::of(42, used.into())
+        };
+        let (start, broker) = (Instant::now(), &mut Broker::here());
+        for id in [inode, inode + 1] {
+            attachments.follow(&of_process(id), start, broker);
+        }
+        fs::write(&path, "second").unwrap();
+        assert!(attachments.detach_changed(start));
+        assert!(attachments.probe(&id(inode)).is_some_and(Result::is_err));
+        assert!(attachments.probe(&id(inode + 1)).is_some_and(Result::is_ok));
     }
 
     #[test]

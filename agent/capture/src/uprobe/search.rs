@@ -252,9 +252,9 @@ fn follow(shared: &Shared, attachments: Attachments<Attached>, scope: Scope, bro
             asked_all = Some(now);
         }
         // New processes come first.
-        followed.find(false, now);
+        followed.find(shared, false, now);
         if all {
-            followed.find(true, now);
+            followed.find(shared, true, now);
         }
         shared.report(followed.facts());
         shared.has_inspected_all.store(true, Ordering::Release);
@@ -296,8 +296,11 @@ struct Followed {
 }
 
 impl Followed {
-    fn find(&mut self, all: bool, now: Instant) {
-        self.attachments.detach_written(now);
+    fn find(&mut self, shared: &Shared, all: bool, now: Instant) {
+        if self.attachments.detach_changed(now) {
+            // Polling of shared memory resumes before the broker answers.
+            shared.covers_all.store(false, Ordering::Release);
+        }
         // Processes may have started while the events were lost.
         let all = MappingEvents::drop_stale(&mut self.mappings) || all;
         // Installed libraries come first: a process that starts announces its names immediately.
@@ -357,9 +360,9 @@ impl Followed {
         if self.failed.is_none() || self.asked.elapsed() < RETRY_DELAY {
             return;
         }
-        let answered = self.broker.processes();
+        let found = self.processes.find(true, &mut self.broker);
         self.asked = Instant::now();
-        self.failed = answered.err().map(|error| in_words(&error));
+        self.failed = found.err().map(|error| in_words(&error));
         if self.failed.is_none() {
             // Processes may have started in the meantime.
             self.starting_until = self.asked + STARTUP_TIME;
@@ -597,6 +600,7 @@ mod tests {
     #[test]
     fn a_broker_that_starts_later_is_asked_at_rest() {
         let mut followed = followed();
+        followed.processes = Processes::new(Scope::AllProcesses, Library::FastDds);
         let shared = Shared {
             facts: Mutex::default(),
             progress: Arc::default(),
