@@ -317,9 +317,22 @@ impl State {
     /// Returns the reason if it does not.
     pub fn ready(&self, now: Instant) -> Result<(), Unready> {
         self.progresses(now)?;
+        let missing = self.agent.missing_object.clone();
+        missing.map_or_else(
+            || self.has_started(now),
+            |reason| Err(Unready::Unseen(reason)),
+        )
+    }
+
+    /// Checks whether every part of the source has started, even if its target does not exist.
+    ///
+    /// # Errors
+    ///
+    /// Returns the reason if one has not.
+    pub fn has_started(&self, now: Instant) -> Result<(), Unready> {
+        self.progresses(now)?;
         let agent = &self.agent;
-        let unseen = agent.missing_object.as_ref().or(agent.stalled.as_ref());
-        let unseen = unseen.or(agent.pending.as_ref());
+        let unseen = agent.stalled.as_ref().or(agent.pending.as_ref());
         unseen.map_or(Ok(()), |reason| Err(Unready::Unseen(reason.clone())))
     }
 
@@ -397,6 +410,8 @@ mod tests {
         };
         assert_eq!(state.ready(start), Err(Unready::Unseen(gone)));
         assert_eq!(state.progresses(start), Ok(()));
+        // A service manager must not wait for an interface that may come after it, or never.
+        assert_eq!(state.has_started(start), Ok(()));
         let later = start + Duration::from_hours(1);
         assert!(state.progresses(later).is_err());
         state.agent.missing_object = None;
@@ -410,7 +425,8 @@ mod tests {
         // Breakpoints that are not set yet have the same effect.
         let pending = "capture.inside: not inspected yet".to_owned();
         state.agent.pending = Some(pending.clone());
-        assert_eq!(state.ready(start), Err(Unready::Unseen(pending)));
+        assert_eq!(state.ready(start), Err(Unready::Unseen(pending.clone())));
+        assert_eq!(state.has_started(start), Err(Unready::Unseen(pending)));
         assert_eq!(state.progresses(start), Ok(()));
     }
 

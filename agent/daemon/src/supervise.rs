@@ -415,8 +415,8 @@ impl Watchdog {
         }
     }
 
-    /// Feeds the watchdog if the capture has progressed. Returns whether the agent has just become
-    /// ready.
+    /// Feeds the watchdog if the capture has progressed. Returns whether the agent has just
+    /// started.
     fn check(&mut self, latest: &SnapshotCell, events: &EventLog) -> bool {
         let now = Instant::now();
         let state = latest.own_state();
@@ -427,14 +427,18 @@ impl Watchdog {
         {
             events.record(event);
         }
-        // A missing target does not stop the watchdog, since a restart cannot restore it.
-        if state.progresses(now).is_err() || (ready.is_err() && !self.ready) {
+        // A missing target delays neither the start nor the watchdog, since a restart cannot
+        // restore it, and it may wait for this service.
+        if state.progresses(now).is_err() || (!self.ready && state.has_started(now).is_err()) {
             return false;
         }
         let first = !self.ready;
         if first {
             self.ready = true;
-            tracing::info!("ready");
+            match &ready {
+                Ok(()) => tracing::info!("ready"),
+                Err(reason) => tracing::warn!(%reason, "started, but not ready"),
+            }
             let _ = sd_notify::notify(&[NotifyState::Ready]);
         }
         let Some(period) = self.period else {

@@ -323,7 +323,7 @@ fn kubernetes_restarts_only_an_agent_that_no_longer_captures() -> Result<()> {
     // An agent whose interface is gone is not ready, and systemd does not restart it either.
     ensure!(path("livenessProbe") == "/livez");
     let startup = &container["startupProbe"];
-    ensure!(path("startupProbe") == "/readyz");
+    ensure!(path("startupProbe") == "/livez");
     let seconds = startup["periodSeconds"]
         .as_u64()
         .zip(startup["failureThreshold"].as_u64())

@@ -100,10 +100,8 @@ impl AgentProcess {
         let deadline = Instant::now() + START_TIMEOUT;
         loop {
             let agent = Agent::reach(&target)?;
-            if agent
-                .get::<Health>("/health")
-                .is_ok_and(|health| health.ready)
-            {
+            let health = agent.get::<Health>("/health").ok();
+            if health.as_ref().is_some_and(|health| health.ready) {
                 return Ok(Some(agent));
             }
             if signals.try_recv().is_ok() {
@@ -114,8 +112,10 @@ impl AgentProcess {
                 bail!("the agent does not start: {reason}");
             }
             if Instant::now() > deadline {
+                let reason = health.and_then(|health| health.reason);
+                let reason = reason.unwrap_or_else(|| "it does not answer".to_owned());
                 let log = self.log.display();
-                bail!("the agent is not ready after {START_TIMEOUT:?}; its log is {log}");
+                bail!("the agent is not ready after {START_TIMEOUT:?}: {reason}; its log is {log}");
             }
             std::thread::sleep(POLL_INTERVAL);
         }
