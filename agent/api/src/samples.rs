@@ -63,7 +63,8 @@ pub struct Sample {
     #[serde(rename = "type")]
     #[cfg_attr(feature = "openapi", schema(example = "sensor_msgs/msg/PointCloud2"))]
     pub message_type: String,
-    /// Capture time of the datagram that completed the message.
+    /// Capture time of the datagram that completed the message. A kept last message with its payload
+    /// has the time of its delivery to this client.
     pub time_ns: i64,
     /// GUID of the message's writer.
     #[cfg_attr(

@@ -82,6 +82,7 @@ impl LineReader {
     }
 
     /// Returns the topic of a line. If the line has no type, the type of an earlier line applies.
+    /// Types that were known at the begin may be those of subscribers alone.
     fn topic(
         &mut self,
         domain_id: u32,
@@ -97,17 +98,11 @@ impl LineReader {
         if let Some(known) = known.filter(same) {
             return Arc::clone(known);
         }
-        let opened = || {
-            let mut topics = self.open.topics.iter();
-            let topic = topics.find(|topic| topic.domain_id == domain_id && topic.topic == name)?;
-            topic.types.first().map(String::as_str)
-        };
-        let message_type = message_type.or_else(opened).unwrap_or_default();
         let topic = Arc::new(Topic {
             domain_id: DomainId(domain_id),
             name: name.into(),
             dds_name: format!("rt{name}").into(),
-            message_type: message_type.into(),
+            message_type: message_type.unwrap_or_default().into(),
             offered: offered.map(|offered| Arc::new(announced(offered))),
         });
         self.topics.insert(key, Arc::clone(&topic));
@@ -201,6 +196,32 @@ mod tests {
             let used = ledger[table.name];
             assert!(used.is_driven(), "{}: {used:?}", table.name);
         }
+    }
+
+    /// Earlier, a loss had the type of a subscriber, and a recording then left out all messages.
+    #[test]
+    fn a_loss_before_the_first_message_has_no_type() {
+        let opened = samples::OpenTopic {
+            topic: "/a".to_owned(),
+            domain_id: 0,
+            types: vec!["std_msgs/msg/Int32".to_owned()],
+        };
+        let mut reader = LineReader::new(Open {
+            topics: vec![opened],
+        });
+        let missed = Line::Missed(samples::Missed {
+            topic: "/a".to_owned(),
+            domain_id: 0,
+            writer: "01".to_owned(),
+            samples: 1,
+            first_sequence_number: 1,
+            last_sequence_number: 1,
+            reason: samples::MissedReason::Lost.into(),
+        });
+        let Some(Item::Missed(missed)) = reader.item(&missed, Bytes::new()) else {
+            panic!("{missed:?}");
+        };
+        assert_eq!(&*missed.topic.message_type, "");
     }
 
     #[test]

@@ -19,7 +19,7 @@ use super::graph::{DiscoveredTopic, GraphSnapshot, PublishedTopic};
 use super::report::{add_missed, add_paused, add_written, custom_data, take_back};
 use super::sample_ring::SampleRing;
 use crate::subscriptions::line::qos;
-use crate::subscriptions::{Item, Topic};
+use crate::subscriptions::{Item, Missed, Topic};
 use crate::tables::{RecordedNames, RecordedTopics, RecordedWriters, RecordingWriters};
 use ros2probe_api::recording_report::{NO_SUBSCRIBER, Report};
 use ros2probe_api::recordings::FilterOptions;
@@ -99,6 +99,16 @@ enum TopicDecision {
         /// Whether the filter selects the topic by what is known.
         is_selected: bool,
     },
+}
+
+/// Where messages of a topic go.
+enum Placed<'r> {
+    /// Into the bag.
+    At(&'r mut RecordedTopic),
+    /// The recording selects the topic, whose type is known with its first message.
+    Later,
+    /// The topic is not recorded.
+    Nowhere,
 }
 
 struct RecordedTopic {
@@ -347,13 +357,33 @@ impl<'a> Recorder<'a> {
                 if self.paused {
                     return Ok(());
                 }
-                if self.place(&missed.topic, missed.samples)?.is_some() {
-                    add_missed(&mut self.report, missed);
-                }
-                Ok(())
+                self.miss(missed)
             }
             Item::End(_) => Ok(()),
         }
+    }
+
+    /// Reports messages that will never be in the bag, if the recording has their topic or may get
+    /// it.
+    fn miss(&mut self, missed: &Missed) -> Result<(), Error> {
+        let is_known = match self.place(&missed.topic, missed.samples)? {
+            Placed::At(_) => true,
+            Placed::Later => self.has_room_in_report(&missed.topic.name),
+            Placed::Nowhere => return Ok(()),
+        };
+        if is_known {
+            add_missed(&mut self.report, missed);
+        } else {
+            self.report.missing += missed.samples;
+            self.report.missing_runs_unnamed += 1;
+        }
+        Ok(())
+    }
+
+    /// Returns whether the report can list a topic.
+    fn has_room_in_report(&self, name: &str) -> bool {
+        let known = &self.report.topics;
+        known.len() < RecordedTopics::CAP || known.contains_key(name)
     }
 
     /// Completes the bag. `error` is the storage error that ended the recording, if any.
@@ -396,15 +426,13 @@ impl<'a> Recorder<'a> {
         };
         let topic = &*sample.topic;
         if self.paused {
-            let known = &self.report.topics;
-            let has_room = known.len() < RecordedTopics::CAP || known.contains_key(&*topic.name);
-            if has_room && self.accepts(&topic.name) {
+            if self.has_room_in_report(&topic.name) && self.accepts(&topic.name) {
                 add_paused(&mut self.report, &topic.name);
             }
             return Ok(());
         }
         let are_writers_full = self.writers.is_full();
-        let Some(taken) = self.place(topic, 1)? else {
+        let Placed::At(taken) = self.place(topic, 1)? else {
             return Ok(());
         };
         let id = taken.id;
@@ -457,9 +485,8 @@ impl<'a> Recorder<'a> {
         !matches!(self.topics.get(name), Some(TopicDecision::Excluded))
     }
 
-    /// Returns the state of a topic with `messages` new messages; `None` if the topic is not
-    /// recorded.
-    fn place(&mut self, topic: &Topic, messages: u64) -> Result<Option<&mut RecordedTopic>, Error> {
+    /// Returns the place of a topic's `messages` new messages.
+    fn place(&mut self, topic: &Topic, messages: u64) -> Result<Placed<'_>, Error> {
         let Topic {
             name, message_type, ..
         } = topic;
@@ -475,20 +502,15 @@ impl<'a> Recorder<'a> {
                 TopicDecision::NoRoom => {
                     self.report.missing += messages;
                     self.report.no_room += messages;
-                    return Ok(None);
+                    return Ok(Placed::Nowhere);
                 }
-                TopicDecision::Untyped { is_selected } => {
-                    if is_selected {
-                        self.report.missing += messages;
-                        self.report.missing_runs_unnamed += 1;
-                    }
-                    return Ok(None);
-                }
+                TopicDecision::Untyped { is_selected: true } => return Ok(Placed::Later),
+                TopicDecision::Untyped { is_selected: false } => return Ok(Placed::Nowhere),
                 place => self.store_decision(name, place),
             }
         }
         let Some(TopicDecision::Recorded(taken)) = self.topics.get_mut(&**name) else {
-            return Ok(None);
+            return Ok(Placed::Nowhere);
         };
         // A loss may precede the first message and has no type.
         if !message_type.is_empty() && taken.description.type_name != **message_type {
@@ -500,9 +522,9 @@ impl<'a> Recorder<'a> {
             {
                 self.report.left_out.push(name.to_string());
             }
-            return Ok(None);
+            return Ok(Placed::Nowhere);
         }
-        Ok(Some(taken))
+        Ok(Placed::At(taken))
     }
 
     /// Stores the decision about a topic. Excluded topics take at most half of the table; beyond

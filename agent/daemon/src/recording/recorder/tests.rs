@@ -258,9 +258,13 @@ fn a_subscriber_of_another_type_does_not_keep_messages_out_of_the_bag() {
     let ended = recorder.finish(None);
     assert_eq!(numbers(&ended), [("/a".to_owned(), 4)]);
     assert!(ended.report.left_out.is_empty());
+    let [run] = &ended.report.missing_runs[..] else {
+        panic!("{:?}", ended.report);
+    };
+    assert_eq!((run.topic.as_str(), run.samples), ("/a", 3));
     assert_eq!(
-        (ended.report.missing, ended.report.missing_runs_unnamed),
-        (3, 1)
+        (ended.report.missing, ended.report.topics["/a"].lost),
+        (3, 3)
     );
 }
 

@@ -50,6 +50,8 @@ pub(super) struct SnapshotTask {
     triggered: Option<Timestamp>,
     /// The bag that receives the messages after its trigger.
     open: Option<OpenBag>,
+    /// Whether a replay has ended. It may go back.
+    has_ended: bool,
 }
 
 struct OpenBag {
@@ -73,6 +75,7 @@ impl SnapshotTask {
             event: recordings.events.last(),
             triggered: None,
             open: None,
+            has_ended: false,
             settings,
             recordings,
         }
@@ -121,6 +124,10 @@ impl SnapshotTask {
     }
 
     pub(super) fn take(&mut self, item: Item) {
+        let is_end = matches!(item, Item::End(_));
+        if std::mem::replace(&mut self.has_ended, is_end) && !is_end {
+            self.forget();
+        }
         let now = match &item {
             Item::Sample(sample) => Some(sample.time),
             Item::Clock(now) => Some(*now),
@@ -130,7 +137,6 @@ impl SnapshotTask {
             Item::Clock(now) if now + SET_BACK < self.clock => now,
             _ => self.clock.max(now.unwrap_or_default()),
         };
-        let is_end = matches!(item, Item::End(_));
         if let Some(open) = &mut self.open {
             let is_late = now.is_some_and(|now| now > open.end);
             let is_early = now.is_some_and(|now| now < open.since);
@@ -153,6 +159,15 @@ impl SnapshotTask {
             Item::Missed(missed) => self.note_missed(missed),
             Item::End(_) => {}
         }
+    }
+
+    /// Forgets what was read before a replay that has ended began again.
+    fn forget(&mut self) {
+        self.ring.clear();
+        self.missed.clear();
+        self.unnamed = 0;
+        self.clock = Timestamp(0);
+        self.triggered = None;
     }
 
     /// Keeps a report of missing messages for the bag of an incident that follows.
