@@ -16,7 +16,7 @@ use clap::Args;
 use jiff::{Timestamp, Unit};
 use ros2probe::client::{Agent, Lines, Next, Target};
 use ros2probe::learn::watchlist::{Source, is_expected, parameters, text};
-use ros2probe::learn::{Learner, Learnt, MAX_SECONDS, Selection};
+use ros2probe::learn::{Learner, Learnt, MAX_SECONDS, Request, Selection};
 use ros2probe_api::health::Health;
 use ros2probe_api::parameters::Parameters;
 use ros2probe_api::path::encoded;
@@ -204,10 +204,14 @@ impl Session {
     fn view(&mut self, agent: &Agent) -> Result<()> {
         let (domain_id, hidden) = (self.domain_id, self.is_hidden);
         let path = format!("/topics?domain_id={domain_id}&hidden={hidden}");
-        let list: TopicList<'_> = agent.get(&path)?;
         let begin = self.begin;
-        let at = begin.map_or(list.timestamp_seconds, |it| it.elapsed().as_secs_f64());
-        self.learner.observe(&list, at);
+        let seconds = || begin.map(|begin| begin.elapsed().as_secs_f64());
+        let sent = seconds();
+        let list: TopicList<'_> = agent.get(&path)?;
+        let request = sent
+            .zip(seconds())
+            .map(|(sent, answered)| Request { sent, answered });
+        self.learner.observe(&list, request);
         self.progress.show(&self.learner, self.seconds);
         Ok(())
     }

@@ -21,6 +21,8 @@ use thresholds::TopicThresholds;
 
 /// Maximum time to learn from, in seconds. It bounds the memory of a topic.
 pub const MAX_SECONDS: u32 = 2 * 3600;
+/// Maximum age of the state of an answer when the agent sends it, in seconds.
+const MAX_STATE_AGE: f64 = 0.25;
 /// Minimum time between two views, in seconds. An earlier view is skipped.
 const MIN_STEP: f64 = 0.5;
 /// Maximum time between two views, in seconds, that is split into seconds.
@@ -40,8 +42,8 @@ pub struct Learner {
     topics: BTreeMap<String, Observation>,
     /// Time of the first and the last view, in Unix seconds.
     period: Option<(f64, f64)>,
-    /// Time of the last view by a clock without steps, in seconds.
-    latest_view: f64,
+    /// Request for the last view; `None` before the first one, and in a replay.
+    latest_request: Option<Request>,
     /// Whole seconds that were counted.
     seconds: u32,
     /// Topics that a watch cannot name, or that are beyond the limit of watches.
@@ -104,6 +106,15 @@ impl Selection {
     }
 }
 
+/// When a view was requested, and when its answer was complete, in seconds by a clock without steps.
+#[derive(Clone, Copy, Debug)]
+pub struct Request {
+    /// Begin of the request.
+    pub sent: f64,
+    /// End of the answer.
+    pub answered: f64,
+}
+
 impl Learner {
     /// Creates a learner that has seen nothing.
     #[must_use]
@@ -112,7 +123,7 @@ impl Learner {
             selection,
             topics: BTreeMap::new(),
             period: None,
-            latest_view: 0.0,
+            latest_request: None,
             seconds: 0,
             unwatchable: BTreeMap::new(),
         }
@@ -147,11 +158,12 @@ impl Learner {
             .map(String::as_str)
     }
 
-    /// Counts what happened since the last view. A view that follows too early is skipped. `at` is
-    /// the time of the view in seconds, by a clock without steps: the robot's clock may be set.
-    pub fn observe(&mut self, list: &TopicList<'_>, at: f64) {
+    /// Counts what happened since the last view. A view that follows too early is skipped.
+    /// `request` is when this client sent the request for the view, and had the answer, by a clock
+    /// without steps; `None` if the robot's clock has none, as in a replay.
+    pub fn observe(&mut self, list: &TopicList<'_>, request: Option<Request>) {
         let now = list.timestamp_seconds;
-        let elapsed = self.period.map_or(0.0, |_| at - self.latest_view);
+        let elapsed = self.elapsed(now, request);
         // A busy agent repeats its last state.
         let is_known = self.latest() == Some(now);
         if is_known || (self.period.is_some() && elapsed < MIN_STEP) {
@@ -171,7 +183,22 @@ impl Learner {
         }
         let first = self.period.map_or(now, |(first, _)| first);
         self.period = Some((first, now));
-        self.latest_view = at;
+        self.latest_request = request;
+    }
+
+    /// Returns the seconds since the last view: by the robot's clock, which a late answer does not
+    /// change. If that is impossible, the clock was set, and the answers' times count.
+    fn elapsed(&self, now: f64, request: Option<Request>) -> f64 {
+        let by_robot = self.latest().map_or(0.0, |last| now - last);
+        let Some((before, request)) = self.latest_request.zip(request) else {
+            return by_robot;
+        };
+        let shortest = request.sent - before.answered - MAX_STATE_AGE;
+        let longest = request.answered - before.sent + MAX_STATE_AGE;
+        match (shortest..=longest).contains(&by_robot) {
+            true => by_robot,
+            false => request.answered - before.answered,
+        }
     }
 
     /// Returns the thresholds of each topic. `None` if less than one second was seen.

@@ -13,6 +13,8 @@ struct Robot {
     /// Time by the robot's clock, and by a clock without steps.
     now: f64,
     steady: f64,
+    /// Time until the next answer arrives.
+    delay: f64,
     learner: Learner,
     topics: Vec<Topic<'static>>,
 }
@@ -44,6 +46,7 @@ impl Robot {
         let mut robot = Self {
             now: 1000.0,
             steady: 7.0,
+            delay: 0.01,
             learner: Learner::new(Selection::default()),
             topics: names.iter().map(topic).collect(),
         };
@@ -56,7 +59,12 @@ impl Robot {
             timestamp_seconds: self.now,
             topics: self.topics.clone(),
         };
-        self.learner.observe(&list, self.steady);
+        let answered = self.steady + std::mem::replace(&mut self.delay, 0.01);
+        let request = Request {
+            sent: self.steady,
+            answered,
+        };
+        self.learner.observe(&list, Some(request));
     }
 
     fn pass(&mut self, seconds: f64) {
@@ -336,6 +344,23 @@ fn a_robot_whose_clock_is_set_keeps_its_thresholds() {
             (Some(8.0), Some(12.0), Some(1)),
             "{step}"
         );
+    }
+}
+
+#[test]
+fn a_late_answer_changes_no_rate() {
+    for delay in [0.45, 0.55, 0.9] {
+        let mut robot = Robot::new(&["/imu"]);
+        for second in 0..60 {
+            if second == 30 {
+                robot.delay = delay;
+            }
+            robot.second(STEADY);
+        }
+        assert_eq!(robot.learner.seconds(), 60, "{delay}");
+        let values = robot.topic_thresholds().values;
+        let rates = (values.min_rate_hz, values.max_rate_hz);
+        assert_eq!(rates, (Some(8.0), Some(12.0)), "{delay}");
     }
 }
 

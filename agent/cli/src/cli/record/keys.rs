@@ -1,14 +1,19 @@
 //! Keys of the terminal: the space bar pauses and resumes.
 
-use std::io::{self, IsTerminal as _, Read as _};
+use std::io::{self, IsTerminal as _};
 use std::sync::mpsc::Sender;
 use std::sync::{Mutex, PoisonError};
+use std::time::Duration;
 
 use ros2probe_daemon::recording::Command;
+use rustix::event::{PollFd, PollFlags, poll};
+use rustix::io::{Errno, retry_on_intr};
 use rustix::process::getpgrp;
 use rustix::termios::{LocalModes, OptionalActions, Termios, tcgetattr, tcgetpgrp, tcsetattr};
 
 const SPACE_KEY: u8 = b' ';
+/// Pause of the keys while another process group has the terminal.
+const BACKGROUND_PAUSE: Duration = Duration::from_millis(500);
 
 /// Settings of the terminal before [`Keys::take`]. The variable is global, because a signal may end
 /// the process.
@@ -62,18 +67,32 @@ fn is_in_foreground() -> bool {
 }
 
 pub(super) fn read_keys(give: Sender<Command>) {
-    let read = move || {
-        for byte in io::stdin().lock().bytes() {
-            match byte {
-                Ok(SPACE_KEY) => {
-                    let _ = give.send(Command::Toggle);
-                }
-                Ok(_) => {}
-                Err(_) => return,
-            }
-        }
-    };
+    let read = move || while read_some(&give).is_ok() {};
     let thread = std::thread::Builder::new().name("keys".to_owned());
     // Without this thread, only the keys have no effect.
     let _ = thread.spawn(read);
+}
+
+/// Waits for keys, and reads them. Fails at the end of the terminal.
+fn read_some(give: &Sender<Command>) -> rustix::io::Result<()> {
+    let stdin = io::stdin();
+    let mut source = [PollFd::new(&stdin, PollFlags::IN)];
+    retry_on_intr(|| poll(&mut source, None))?;
+    if !source[0].revents().contains(PollFlags::IN) {
+        return Err(Errno::IO);
+    }
+    // A read would stop a process that a shell has put into the background.
+    if !is_in_foreground() {
+        std::thread::sleep(BACKGROUND_PAUSE);
+        return Ok(());
+    }
+    let mut keys = [0; 64];
+    let read = retry_on_intr(|| rustix::io::read(&stdin, &mut keys))?;
+    if read == 0 {
+        return Err(Errno::IO);
+    }
+    for _ in keys.iter().take(read).filter(|key| **key == SPACE_KEY) {
+        let _ = give.send(Command::Toggle);
+    }
+    Ok(())
 }
