@@ -64,6 +64,12 @@ export function chainAddress(chain) {
   return address('chains', chain.from, wordsOf(chain));
 }
 
+/** Returns the request for late calls of a chain's callbacks. @param {Chain} chain */
+export function lateCallsAddress(chain) {
+  const words = { from: chain.from, to: chain.to, domain_id: String(chain.domain_id) };
+  return `why?${new URLSearchParams({ ...words, history: 'true' })}`;
+}
+
 /** Returns the words of the graph's address that select a chain. @param {Chain} chain */
 export function graphWords(chain) {
   const { to, domain, method, way } = wordsOf(chain);

@@ -1,7 +1,7 @@
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
-import { chainAddress, chainsThrough, chosen, graphWords, marked, rowsOf, section, slowest, stepKey,
-  throughGraph, tickText, topicsOf, waterfall, wayOf } from '../chains.js';
+import { chainAddress, chainsThrough, chosen, graphWords, lateCallsAddress, marked, rowsOf, section,
+  slowest, stepKey, throughGraph, tickText, topicsOf, waterfall, wayOf } from '../chains.js';
 import { build } from '../graph-model.js';
 import { parse } from '../router.js';
 import { State } from '../state.js';
@@ -57,6 +57,8 @@ test('an address leads to the same chain, also among chains of the same ends', (
     assert.equal(route?.name, '/points');
     assert.equal(chosen([one, other, causal], '/points', route?.query ?? {}), chain);
     const words = /** @type {any} */ (graphWords(chain));
+    const late = new URL(lateCallsAddress(chain), 'http://robot/').searchParams;
+    assert.deepEqual([late.get('from'), late.get('to'), late.get('history')], ['/points', '/cmd', 'true']);
     assert.equal(chosen([one, other, causal], words.chain, words), chain);
   }
   assert.notEqual(wayOf(one), wayOf(other));

@@ -1,16 +1,20 @@
 // Chains of messages through nodes: a list, and a waterfall of the hops of one.
 
-import { chainAddress, chainsThrough, chosen, graphWords, NO_CHAIN, partsOf, rowsOf, slowest,
-  tickText, topicsOf, waterfall, wayOf } from '../chains.js';
+import { chainAddress, chainsThrough, chosen, graphWords, lateCallsAddress, NO_CHAIN, partsOf,
+  rowsOf, slowest, tickText, topicsOf, waterfall, wayOf } from '../chains.js';
 import { count, duration, several, shortened, visible, when } from '../format.js';
 import { address } from '../router.js';
 import { replaceAddress, state, useLive, usePoll } from '../store.js';
 import { sorted, Table } from '../table.js';
 import { Failed, Figure, Filter, html, Mark, matches, Name } from '../ui.js';
+import { useState } from '../vendor/hooks.mjs';
+import { Late } from './late.js';
 
 const EVERY_MS = 2000;
 /** Between requests of views that only name chains. */
 const RARELY_MS = 5000;
+/** Between requests that keep calls observed. The agent observes them for 10 s after each. */
+const LATE_MS = 4000;
 /** Most chains named beside a topic or node. */
 const MOST_NAMED = 5;
 
@@ -155,7 +159,18 @@ export function ChainView({ from, query }) {
       ${limit != null && html`<${Figure} label="limit" value=${duration(limit)} />`}
       <${Figure} label="messages" value=${count(chain.messages)} />
       <${Figure} label="last message" value=${when(chain.last_seen_seconds)} /></div>
-      <${Waterfall} chain=${chain} limit=${limit} />`}`;
+      <${Waterfall} chain=${chain} limit=${limit} />
+      <${WhyLate} key=${chainAddress(chain)} chain=${chain} />`}`;
+}
+
+/** Shows the late calls of a chain's callbacks on request.
+ * @param {{chain: import('../chains.js').Chain}} props */
+function WhyLate({ chain }) {
+  const [observes, observe] = useState(false);
+  const answer = usePoll(observes ? lateCallsAddress(chain) : null, LATE_MS);
+  return html`<section aria-labelledby="why"><h2 id="why">Late calls of its callbacks</h2>
+    ${observes ? html`<${Late} answer=${answer} />`
+      : html`<p><button type="button" onClick=${() => observe(true)}>Why late?</button></p>`}</section>`;
 }
 
 /** @param {{name: string|null, domain: number}} props */

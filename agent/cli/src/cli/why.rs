@@ -39,6 +39,7 @@ Examples:
   rp why
   rp why /cmd_vel --above 20
   rp why --node /controller --last 10m
+  rp why --chain /points /cmd_vel
   rp why /scan --json | jq '.callbacks[].examples[0].parts'")]
 pub(crate) struct Why {
     /// Only callbacks of this topic or node
@@ -47,6 +48,9 @@ pub(crate) struct Why {
     /// Only callbacks of this node
     #[arg(long, conflicts_with = "name")]
     node: Option<String>,
+    /// Only callbacks of the chains between these topics, as `rp chain` lists them
+    #[arg(long, num_args = 2, value_names = ["FROM", "TO"], conflicts_with_all = ["name", "node"])]
+    chain: Option<Vec<String>>,
     /// Calls are late that take or wait longer than this, in milliseconds
     #[arg(long, value_name = "MS", value_parser = milliseconds)]
     above: Option<f64>,
@@ -98,6 +102,9 @@ impl Why {
         if let Some(name) = self.name.as_ref().or(self.node.as_ref()) {
             parameters.push(format!("name={}", encoded(name)));
         }
+        if let Some([from, to]) = self.chain.as_deref() {
+            parameters.push(format!("from={}&to={}", encoded(from), encoded(to)));
+        }
         if let Some(above) = self.above {
             parameters.push(format!("above_ms={above}"));
         }
@@ -121,9 +128,13 @@ impl Why {
             let reason = reason.unwrap_or("capture.inside or capture.late is off");
             return format!("callbacks are not observed: {reason}");
         }
-        match self.name.as_ref().or(self.node.as_ref()) {
-            Some(name) => format!("no call of a callback of {name} was late (see --above)"),
-            None => "no call of a callback was late (see --above)".to_owned(),
+        let name = self.name.as_ref().or(self.node.as_ref());
+        match (name, self.chain.as_deref()) {
+            (Some(name), _) => format!("no call of a callback of {name} was late (see --above)"),
+            (None, Some([from, to])) => format!(
+                "no call of a callback from {from} to {to} was late (see --above, and `rp chain`)"
+            ),
+            (None, _) => "no call of a callback was late (see --above)".to_owned(),
         }
     }
 }

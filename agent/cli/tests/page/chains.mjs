@@ -123,6 +123,9 @@ async function bars(tab) {
   await reads(rows(tab).last(), 'End to end');
   await tab.shows(/Recognised by\s+stamps/);
   await tab.shows(/slow/);
+  // A capture has no calls, and the agent says so.
+  await tab.page.getByRole('button', { name: 'Why late?' }).click();
+  await tab.shows(/Late calls are not reported/);
   // Screen readers have a table with a name for each column and row.
   const table = tab.page.getByRole('table', { name: 'Hops of the chain' });
   assert.deepEqual((await table.getByRole('columnheader').allInnerTexts()).map((text) =>

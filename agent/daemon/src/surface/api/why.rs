@@ -14,15 +14,18 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Context;
+use super::chains::parts;
 use super::inside::{owner, trigger};
 use super::parameters::Parameters;
 use super::problem::{Code, Problem};
 use super::scope::Domain;
 use crate::agent_facts::InsideSourceFacts;
+use ros2probe_api::chains::{Chain, Hop};
 use ros2probe_api::why::{
     Blocked, Cause, LateCall, LateCallSummary, LateCallback, OtherThread, Part, PreviousCall, Why,
 };
 use ros2probe_model::facts::calls::facts::{self, InsideFacts, LateExample};
+use ros2probe_model::facts::calls::report::Trigger;
 use ros2probe_model::facts::calls::{late, other_thread};
 use ros2probe_model::facts::model_time::ModelTime;
 use ros2probe_model::facts::wall_clock::WallClock;
@@ -47,6 +50,11 @@ struct Of {
     domain_id: Option<u32>,
     /// ROS name of a topic or node; by default all.
     name: Option<String>,
+    /// ROS name of the first topic of chains, as for `/chains`. Then only callbacks of their nodes
+    /// count: of the messages of the chain, and of timers.
+    from: Option<String>,
+    /// ROS name of the last topic of chains, as for `/chains`.
+    to: Option<String>,
     /// Calls of these callbacks are late if they take or wait longer than this, until ten seconds
     /// after the last request. Without it, the bound is `max_latency_ms` of the topic. Without
     /// that, it is three times the 99th percentile of the callback's calls.
@@ -93,9 +101,13 @@ async fn show(
     let state = context.state().await;
     let snapshot = state.known();
     let source = state.agent.inside.as_ref();
+    let ends = (of.from.as_deref(), of.to.as_deref());
+    let chains =
+        (ends != (None, None)).then(|| parts(snapshot.chains.chains.iter(), ends.0, ends.1));
     let is_meant = |callback: &facts::LateCallback| {
         let name = of.name.as_deref();
         domain.admits(callback.owner.domain_id)
+            && (chains.as_ref()).is_none_or(|chains| is_in_any(chains, callback))
             && (name.is_none()
                 || name == callback.trigger.name()
                 || name == callback.owner.node.as_deref())
@@ -105,6 +117,23 @@ async fn show(
         has_history: of.history,
     };
     Ok(Json(why(snapshot, source, selection, is_meant)).into_response())
+}
+
+/// Returns whether a callback handles messages of one of these chains, or is a timer of one of their
+/// nodes. A timer may publish what a callback has kept.
+fn is_in_any(chains: &[Chain<'_>], callback: &facts::LateCallback) -> bool {
+    let node = callback.owner.node.as_deref();
+    let is_in = |hop: &Hop<'_>| match &callback.trigger {
+        Trigger::Subscription(topic) | Trigger::IntraProcess(Some(topic)) => {
+            let is_other = |(one, other)| one != other;
+            **topic == *hop.input && !node.zip(hop.node.as_deref()).is_some_and(is_other)
+        }
+        Trigger::Timer(_) => node.is_some() && node == hop.node.as_deref(),
+        Trigger::IntraProcess(None) | Trigger::Service(_) => false,
+    };
+    chains
+        .iter()
+        .any(|chain| chain.domain_id == callback.owner.domain_id.0 && chain.hops.iter().any(is_in))
 }
 
 /// Returns a number from 0 to `largest`, or the problem of another one.
@@ -352,5 +381,41 @@ mod tests {
         assert_eq!(listed(&snapshot, minute, true), [call]);
         snapshot.at = snapshot.at + Duration::from_secs(61);
         assert_eq!(listed(&snapshot, minute, true), []);
+    }
+
+    #[test]
+    fn callbacks_of_a_chain_are_those_of_its_messages_and_timers_of_its_nodes() {
+        let snapshot = sample_robot::snapshot(["/points"]);
+        let all = snapshot.chains.chains.iter();
+        let chains = parts(all.clone(), Some("/points"), Some("/cmd_vel"));
+        assert_eq!(chains[0].hops.len(), 2);
+        let known = snapshot.inside.as_ref().unwrap();
+        let is_in = |trigger: Trigger, node: Option<&str>| {
+            let mut callback = known.late[0].clone();
+            callback.owner.node = node.map(Into::into);
+            callback.trigger = trigger;
+            is_in_any(&chains, &callback)
+        };
+        let points = || Trigger::Subscription("/points".into());
+        let timer = || Trigger::Timer(None);
+        assert!(is_in(points(), Some("/filter")));
+        assert!(is_in(points(), None));
+        assert!(!is_in(points(), Some("/recorder")));
+        assert!(!is_in(Trigger::Subscription("/cmd_vel".into()), None));
+        assert!(is_in(
+            Trigger::IntraProcess(Some("/filtered".into())),
+            Some("/controller")
+        ));
+        assert!(!is_in(Trigger::IntraProcess(None), Some("/filter")));
+        assert!(is_in(timer(), Some("/controller")));
+        assert!(!is_in(timer(), Some("/lidar")) && !is_in(timer(), None));
+        // A chain of another domain, and the part that does not reach the node.
+        let mut other = known.late[0].clone();
+        other.owner.node = Some("/filter".into());
+        assert!(is_in_any(&chains, &other));
+        other.owner.domain_id.0 += 1;
+        assert!(!is_in_any(&chains, &other));
+        let last = parts(all, Some("/filtered"), None);
+        assert!(!is_in_any(&last, &known.late[0]));
     }
 }
