@@ -1,8 +1,9 @@
 //! Checks of the agent itself: whether it answers, observes, loses nothing and persists its state.
 //! If no agent runs, obstacles to starting one.
 
+use std::collections::BTreeSet;
 use std::fs;
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::os::unix::fs::{MetadataExt as _, PermissionsExt as _};
 use std::path::Path;
 
@@ -20,6 +21,8 @@ const HEALTH_SOURCE: &str = "GET /health";
 /// State directory of the package.
 const STATE_DIRECTORY: &str = "/var/lib/ros2probe";
 const SOCKET_TABLES: [&str; 2] = ["/proc/net/tcp", "/proc/net/tcp6"];
+/// Tables of the addresses of this host: of IPv4 and of IPv6.
+const ADDRESS_TABLES: [&str; 2] = ["/proc/net/fib_trie", "/proc/net/if_inet6"];
 /// State of a listening socket in `/proc/net/tcp` and `/proc/net/tcp6`.
 const LISTENING_STATE: &str = "0A";
 /// Maximum number of bytes read of each of [`SOCKET_TABLES`].
@@ -431,6 +434,57 @@ fn ports(host: &HostState, config: &Config) -> Vec<Finding> {
         .filter(|(_, address)| taken.contains(&address.port()))
         .map(|(key, address)| port_in_use_finding(key, address))
         .collect()
+}
+
+/// Returns the findings for listen addresses that no interface has.
+#[must_use]
+pub fn absent_addresses(host: &HostState, config: &Config) -> Vec<Finding> {
+    let Some(local) = local_addresses(host) else {
+        return Vec::new();
+    };
+    let wanted = [
+        ("metrics.listen", config.metrics.listen),
+        ("api.listen", config.api.listen),
+        ("foxglove.listen", config.foxglove.listen),
+    ];
+    let wanted = wanted
+        .into_iter()
+        .filter_map(|(key, address)| Some((key, address?.ip().to_canonical())));
+    let absent = wanted.filter(|(_, address)| {
+        !address.is_unspecified() && !address.is_loopback() && !local.contains(address)
+    });
+    absent
+        .map(|(key, address)| {
+            let sentence = format!(
+                "no interface has the address {address} of {key}: clients reach it once one has"
+            );
+            Finding::new(AREA, "addresses", Severity::Warning, sentence)
+                .seen(address.to_string(), ADDRESS_TABLES.join(", "))
+                .remedy("ip -brief address    # lists the addresses of this host")
+        })
+        .collect()
+}
+
+/// Returns the addresses of this host's interfaces; `None` if the kernel does not list them.
+fn local_addresses(host: &HostState) -> Option<BTreeSet<IpAddr>> {
+    let [fourth, sixth] = ADDRESS_TABLES;
+    let trie = host.files.bytes(fourth, MAX_SOCKETS).ok()?;
+    let (mut addresses, mut last) = (BTreeSet::new(), None::<IpAddr>);
+    for line in String::from_utf8_lossy(&trie).lines() {
+        match line.trim_start().strip_prefix("|-- ") {
+            Some(address) => last = address.parse().ok(),
+            None if line.trim_start() == "/32 host LOCAL" => addresses.extend(last),
+            None => {}
+        }
+    }
+    // A host without IPv6 has no such file.
+    let listed = host.files.bytes(sixth, MAX_SOCKETS).unwrap_or_default();
+    let listed = String::from_utf8_lossy(&listed);
+    addresses.extend(listed.lines().filter_map(|line| {
+        let digits = line.split_whitespace().next()?;
+        Some(IpAddr::V6(u128::from_str_radix(digits, 16).ok()?.into()))
+    }));
+    Some(addresses)
 }
 
 fn port_in_use_finding(key: &str, address: SocketAddr) -> Finding {

@@ -236,6 +236,32 @@ fn a_port_in_use_is_reported_as_an_obstacle_to_starting_an_agent() {
 }
 
 #[test]
+fn a_listen_address_that_no_interface_has_is_reported() {
+    let trie = "Local:\n  +-- 0.0.0.0/0 3 0 5\n     |-- 10.8.0.0\n        /24 link UNICAST\n     \
+                |-- 10.8.0.2\n        /32 host LOCAL\n";
+    let sixth = "fd000000000000000000000000000002 04 40 00 82     eth0\n";
+    let (_directory, known) = host(&[("/proc/net/fib_trie", trie), ("/proc/net/if_inet6", sixth)]);
+    let absent = |host: &HostState, address: &str| {
+        let mut config = Config::default();
+        config.foxglove.listen = Some(address.parse().unwrap());
+        absent_addresses(host, &config).len()
+    };
+    for (address, count) in [
+        ("10.8.0.2:8765", 0),
+        ("[fd00::2]:8765", 0),
+        ("127.0.0.1:8765", 0),
+        ("0.0.0.0:8765", 0),
+        ("10.8.0.0:8765", 1),
+        ("10.8.0.20:8765", 1),
+        ("[fd00::3]:8765", 1),
+    ] {
+        assert_eq!(absent(&known, address), count, "{address}");
+    }
+    let (_directory, unknown) = host(&[]);
+    assert_eq!(absent(&unknown, "10.8.0.20:8765"), 0);
+}
+
+#[test]
 fn an_agent_that_refuses_access_leads_to_one_unknown_finding() {
     let (_directory, host) = host(&[]);
     let findings = absent(&host, &Config::default(), "permission denied", true);
