@@ -24,7 +24,7 @@ use std::time::Duration;
 use foldhash::HashMap;
 use ros2probe_wire::discovery::{EndpointAnnouncement, ParticipantAnnouncement};
 use ros2probe_wire::names::DdsTopic;
-use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, RtpsDuration, SequenceNumber};
+use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, SequenceNumber};
 
 use crate::facts::bounded::TableFacts;
 use crate::facts::bounded::{Bounded, Counted, Sum};
@@ -40,7 +40,7 @@ use disposals::Disposals;
 use entity::DiscoveredEntity;
 use eviction::{Newcomer, Table, Victims};
 pub use facts::{Addresses, DomainSource, Endpoint, Node, Origin, Participant, ParticipantProxy};
-use facts::{domain, named};
+use facts::{Relayers, domain, named};
 pub use memory::{Memory, hexadecimal};
 use pending::PendingTable;
 pub use priority::Priority;
@@ -276,9 +276,15 @@ impl Discovery {
         let proxy = ParticipantProxy::of(announcement);
         if let Some(participant) = self.participants.get_mut(&guid.prefix) {
             participant.seen(origin.at);
-            if participant.relayer.is_some() && participant.relayer != relayer {
-                participant.relayer = relayer;
-                self.revision += 1;
+            match (&mut participant.relayers, relayer) {
+                (Some(relayers), Some(relayer)) => {
+                    self.revision += u64::from(relayers.add(relayer));
+                }
+                (relayers @ Some(_), None) => {
+                    *relayers = None;
+                    self.revision += 1;
+                }
+                (None, _) => {}
             }
             let addresses = Addresses::of(announcement);
             if participant.addresses != addresses {
@@ -313,7 +319,7 @@ impl Discovery {
             watched: 0,
             local: false,
             came_by_tcp: false,
-            relayer,
+            relayers: relayer.map(|relayer| Relayers::of([relayer])),
             sends: false,
             domain_source: source,
             nodes_from: None,
@@ -342,10 +348,9 @@ impl Discovery {
     /// Returns the end of a participant's lease. A server that others relay may be gone as well, so
     /// it keeps no participant.
     fn lease_end(&self, participant: &Participant) -> Option<ModelTime> {
-        let is_direct = |relayer: &Participant| relayer.relayer.is_none();
-        let relayer = participant.relayer.as_ref();
-        let relayer = relayer.and_then(|prefix| self.participants.get(prefix));
-        participant.lease_end(relayer.is_some_and(|relayer| is_direct(relayer)))
+        let relayers = participant.relayers.iter().flat_map(Relayers::iter);
+        let mut relayers = relayers.filter_map(|prefix| self.participants.get(&prefix));
+        participant.lease_end(relayers.any(|relayer| relayer.relayers.is_none()))
     }
 
     /// Removes participants whose lease has expired at `now`.
@@ -412,7 +417,11 @@ impl Discovery {
         let Some(participant) = self.participants.remove(&prefix) else {
             return;
         };
-        self.end_leases_of_relayed(prefix, at);
+        for relayed in self.participants.values_mut() {
+            if let Some(relayers) = &mut relayed.relayers {
+                relayers.remove(prefix, at);
+            }
+        }
         let domain_id = participant.domain_id;
         let guid = Guid::new(prefix, EntityId::PARTICIPANT);
         if let Some(event) = event {
@@ -429,19 +438,6 @@ impl Discovery {
             for node in participant.nodes {
                 let entity = DiscoveredEntity::node(domain_id, guid, &node.name);
                 self.note(&entity, event, at, journal);
-            }
-        }
-    }
-
-    /// Begins the leases of participants that a removed one relayed, and limits those without an
-    /// end: their server no longer disposes of them.
-    fn end_leases_of_relayed(&mut self, relayer: GuidPrefix, at: ModelTime) {
-        for participant in self.participants.values_mut() {
-            if participant.relayer == Some(relayer) {
-                participant.last_seen = participant.last_seen.max(at);
-                if participant.proxy.lease == RtpsDuration::Infinite {
-                    participant.restored = participant.restored.max(Some(at));
-                }
             }
         }
     }

@@ -121,7 +121,7 @@ pub struct Participant {
     pub proxy: ParticipantProxy,
     /// Unicast addresses.
     pub addresses: Addresses,
-    /// Time of restoration from saved state, or of the end of its relayer, until its first packet.
+    /// Time of restoration from saved state, until its first packet.
     pub restored: Option<ModelTime>,
     /// Its domain.
     pub domain_id: DomainId,
@@ -139,9 +139,8 @@ pub struct Participant {
     pub(crate) local: bool,
     /// Whether one of its messages came by TCP.
     pub(super) came_by_tcp: bool,
-    /// Participant that relayed its last announcement, if only others have announced it: a
-    /// Discovery Server.
-    pub(super) relayer: Option<GuidPrefix>,
+    /// Who has announced it, if it was only others.
+    pub(super) relayers: Option<Relayers>,
     /// Whether it has sent user data.
     pub(super) sends: bool,
     pub(super) domain_source: DomainSource,
@@ -221,6 +220,51 @@ impl ParticipantProxy {
     }
 }
 
+/// Participants that relayed the announcement of another one: Discovery Servers. The first four are
+/// known.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(super) struct Relayers {
+    prefixes: [Option<GuidPrefix>; 4],
+    /// When one was removed last. The others may keep the participant.
+    ended: Option<ModelTime>,
+}
+
+impl Relayers {
+    pub(super) fn of(prefixes: impl IntoIterator<Item = GuidPrefix>) -> Self {
+        let mut relayers = Self::default();
+        for prefix in prefixes {
+            relayers.add(prefix);
+        }
+        relayers
+    }
+
+    /// Adds a relayer, and returns whether it is new.
+    pub(super) fn add(&mut self, prefix: GuidPrefix) -> bool {
+        self.ended = None;
+        let is_known = self.iter().any(|known| known == prefix);
+        let place = self.prefixes.iter_mut().find(|place| place.is_none());
+        match place.filter(|_| !is_known) {
+            Some(place) => {
+                *place = Some(prefix);
+                true
+            }
+            None => false,
+        }
+    }
+
+    /// Forgets a relayer that was removed at this time.
+    pub(super) fn remove(&mut self, prefix: GuidPrefix, at: ModelTime) {
+        let place = self.prefixes.iter_mut().find(|it| **it == Some(prefix));
+        if place.is_some_and(|place| place.take().is_some()) {
+            self.ended = Some(at);
+        }
+    }
+
+    pub(super) fn iter(&self) -> impl Iterator<Item = GuidPrefix> {
+        self.prefixes.iter().copied().flatten()
+    }
+}
+
 impl Addresses {
     pub(super) fn of(announcement: &ParticipantAnnouncement) -> Self {
         let udp = |locators: &[Locator]| {
@@ -253,13 +297,15 @@ impl Participant {
     /// Server relays an announcement once, and disposes of the participant when its lease ends: the
     /// lease does not count while the server exists (`is_kept`).
     pub(super) fn lease_end(&self, is_kept: bool) -> Option<ModelTime> {
+        let orphaned = self.relayers.as_ref().and_then(|relayers| relayers.ended);
+        let orphaned = orphaned.filter(|_| !is_kept);
         let lease = match self.proxy.lease {
             RtpsDuration::Finite(lease) if !is_kept => lease,
-            // The participant may have stopped while no agent ran, so a lease without an end is
-            // limited.
-            _ => self.restored.map(|_| MAX_SILENCE)?,
+            // The participant may have stopped while no agent ran, or no server will dispose of it.
+            // So a lease without an end is limited.
+            _ => self.restored.or(orphaned).map(|_| MAX_SILENCE)?,
         };
-        Some(self.last_seen + lease)
+        Some(self.last_seen.max(orphaned.unwrap_or_default()) + lease)
     }
 
     /// Returns its priority in a full table.

@@ -22,7 +22,9 @@ use serde::{Deserialize, Serialize};
 use super::Change;
 use super::Discovery;
 use super::MAX_NAME_LEN;
-use super::facts::{Addresses, DomainSource, Endpoint, Node, Participant, ParticipantProxy, named};
+use super::facts::{
+    Addresses, DomainSource, Endpoint, Node, Participant, ParticipantProxy, Relayers, named,
+};
 use crate::facts::bounded::Bounded;
 use crate::facts::model_time::ModelTime;
 use crate::facts::tables::ParticipantEndpoints;
@@ -58,9 +60,9 @@ pub struct Remembered {
     tcp: bool,
     #[serde(default)]
     announces_by_tcp: bool,
-    /// GUID prefix of the participant that relayed it; older agents did not save it.
+    /// GUID prefixes of the participants that relayed it; older agents did not save them.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    relayer: Option<String>,
+    relayers: Option<Vec<String>>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     product_version: Option<String>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -218,7 +220,10 @@ impl Remembered {
             shared_memory: proxy.shared_memory,
             tcp: proxy.tcp,
             announces_by_tcp: proxy.announces_by_tcp,
-            relayer: participant.relayer.map(|prefix| prefix.to_string()),
+            relayers: participant.relayers.as_ref().map(|relayers| {
+                let prefixes = relayers.iter().map(|prefix| prefix.to_string());
+                prefixes.collect()
+            }),
             product_version: text(&proxy.product_version),
             machine_id: text(&proxy.machine_id),
             addresses: participant.addresses.clone(),
@@ -271,9 +276,10 @@ impl Remembered {
             watched: 0,
             local: false,
             came_by_tcp: false,
-            relayer: (self.relayer.as_deref())
-                .and_then(hexadecimal)
-                .map(GuidPrefix),
+            relayers: self.relayers.as_ref().map(|prefixes| {
+                let prefixes = prefixes.iter().filter_map(|prefix| hexadecimal(prefix));
+                Relayers::of(prefixes.map(GuidPrefix))
+            }),
             sends: false,
             domain_source: self.domain_source,
             nodes_from: nodes_from.and_then(|(writer, number)| {

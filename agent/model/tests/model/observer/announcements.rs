@@ -144,6 +144,25 @@ fn a_participant_that_a_discovery_server_announced_once_stays_until_it_is_dispos
     world.wait(2000);
     assert!(world.snapshot().participants.is_empty());
 
+    // A server that comes back has never heard of the participant, unless it relays it again.
+    let mut back = World::new(&["/**"]);
+    wait(&mut back, 1);
+    back.put(relayed(Message::from(server)));
+    back.wait(10_000);
+    wait(&mut back, 20);
+    let left = back.snapshot().participants;
+    assert_eq!((left.len(), left[0].guid.prefix), (1, server));
+
+    // One of two servers ends, and the other one keeps the participant.
+    let second = GuidPrefix(*b"DS\x01_EPROSIMA");
+    let mut two = World::new(&["/**"]);
+    for server in [server, second] {
+        two.spdp(server, 3);
+        two.put(relayed(Message::from(server)));
+    }
+    wait(&mut two, 60);
+    assert_eq!(two.snapshot().participants.len(), 2);
+
     // A restarted agent cannot know that the server disposed of a participant in the meantime.
     let memory: Memory = serde_json::from_str(&memory).unwrap();
     let mut restarted = World::new(&["/**"]);
