@@ -64,7 +64,8 @@ pub struct LateCallback<'a> {
     pub owner: Owner<'a>,
     /// Trigger of the callback.
     pub trigger: Trigger<'a>,
-    /// All calls of the callback since its observation began; null if the process has ended.
+    /// All calls of the callback since its observation began, which is later than that of the late
+    /// calls after a rest; null if the process has ended, or if the late calls are more.
     pub calls: Option<u64>,
     /// Late calls since the agent started.
     pub late_calls: u64,

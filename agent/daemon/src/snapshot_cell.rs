@@ -53,9 +53,9 @@ pub struct SnapshotCell {
 #[derive(Clone, Debug)]
 struct LateQuestion {
     at: Instant,
-    /// Topic or node; `None` = all.
-    name: Option<Arc<str>>,
-    above: Option<Duration>,
+    /// What tells questions apart: the topic, node or chain; `None` = all.
+    key: Option<Arc<str>>,
+    bound: Option<RequestedBound>,
 }
 
 /// Wakes the capture thread from its wait for packets. Without a socket pair, readers wait until
@@ -164,21 +164,23 @@ impl SnapshotCell {
         age.is_some_and(|age| age <= REQUEST_LIFETIME)
     }
 
-    /// Notes that a client requests the causes of late calls. With `above`, calls of callbacks of
-    /// this topic or node, or of all, are late if they take longer.
-    pub fn request_late_calls(&self, name: Option<&str>, above: Option<Duration>) {
+    /// Notes that a client requests the causes of late calls of this topic, node or chain, or of all.
+    /// A bound lasts until ten seconds after the last request with it: another client's request
+    /// without one does not end it.
+    pub fn request_late_calls(&self, key: Option<&str>, bound: Option<RequestedBound>) {
         self.request_calls();
         let mut questions = self.late_questions();
         questions.retain(|question| question.at.elapsed() <= REQUEST_LIFETIME);
-        let is_same = |question: &LateQuestion| question.name.as_deref() == name;
-        let question = LateQuestion {
-            at: Instant::now(),
-            name: name.map(Arc::from),
-            above,
-        };
-        questions.retain(|known| !is_same(known));
-        if questions.len() < MAX_LATE_QUESTIONS {
-            questions.push(question);
+        let has_bound = bound.is_some();
+        questions.retain(|known| known.key.as_deref() != key || known.bound.is_some() != has_bound);
+        let same_kind = questions.iter();
+        let same_kind = same_kind.filter(|known| known.bound.is_some() == has_bound);
+        if same_kind.count() < MAX_LATE_QUESTIONS {
+            questions.push(LateQuestion {
+                at: Instant::now(),
+                key: key.map(Arc::from),
+                bound,
+            });
         }
     }
 
@@ -187,15 +189,15 @@ impl SnapshotCell {
     pub fn late_demand(&self, now: Instant) -> LateDemand {
         let mut questions = self.late_questions();
         questions.retain(|question| now.saturating_duration_since(question.at) <= REQUEST_LIFETIME);
-        let bounds = questions.iter().filter_map(|question| {
-            Some(RequestedBound {
-                name: question.name.clone(),
-                above: question.above?,
-            })
-        });
+        let bounds = questions.iter();
+        let mut bounds: Vec<_> = bounds
+            .filter_map(|question| question.bound.clone())
+            .collect();
+        // The order of requests must not decide. The smallest one that applies counts.
+        bounds.sort_by_key(|bound| bound.above);
         LateDemand {
             has_question: !questions.is_empty(),
-            bounds: bounds.collect(),
+            bounds,
         }
     }
 
@@ -363,6 +365,7 @@ impl State {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use ros2probe_capture::inside::late::BoundScope;
     use ros2probe_capture::system::wait;
 
     #[test]
@@ -517,16 +520,22 @@ mod tests {
         let cell = SnapshotCell::new(SourceKind::Host);
         let after = |seconds| cell.late_demand(Instant::now() + Duration::from_secs(seconds));
         assert_eq!(after(0), LateDemand::default());
-        let above = |milliseconds| Some(Duration::from_millis(milliseconds));
+        let above = |milliseconds| {
+            Some(RequestedBound {
+                of: BoundScope::All,
+                above: Duration::from_millis(milliseconds),
+            })
+        };
         cell.request_late_calls(Some("/scan"), above(5));
         cell.request_late_calls(Some("/scan"), above(7));
         for _ in 0..100 {
             cell.request_late_calls(None, None);
+            // The page asks without a bound.
+            cell.request_late_calls(Some("/scan"), None);
         }
         let demand = after(9);
         assert!(demand.has_question);
-        assert_eq!(demand.bounds.len(), 1);
-        assert_eq!(Some(demand.bounds[0].above), above(7));
+        assert_eq!(demand.bounds, [above(7).unwrap()]);
         assert_eq!(after(11), LateDemand::default());
     }
 
@@ -534,7 +543,11 @@ mod tests {
     fn late_call_requests_are_bounded() {
         let cell = SnapshotCell::new(SourceKind::Host);
         for number in 0..1000 {
-            cell.request_late_calls(Some(&format!("/topic_{number}")), Some(Duration::ZERO));
+            let bound = RequestedBound {
+                of: BoundScope::All,
+                above: Duration::ZERO,
+            };
+            cell.request_late_calls(Some(&format!("/topic_{number}")), Some(bound));
         }
         let bounds = cell.late_demand(Instant::now()).bounds;
         assert_eq!(bounds.len(), MAX_LATE_QUESTIONS);

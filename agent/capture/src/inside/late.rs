@@ -16,10 +16,11 @@ use ros2probe_model::facts::calls::late::{
 };
 use ros2probe_model::facts::calls::other_thread::{OtherThread, Priority};
 use ros2probe_model::facts::calls::report::{ThreadStates, Trigger};
+use ros2probe_model::facts::glob;
 use ros2probe_model::facts::names::NodeName;
-use ros2probe_wire::Timestamp;
 use ros2probe_wire::inside::late::{self, Bound, mode, wait};
 use ros2probe_wire::inside::{BUCKETS, Handle, bucket_start, kind, thread_state};
+use ros2probe_wire::{DomainId, Timestamp};
 
 use super::programs::{Events, Programs, Tables};
 use super::table::ProcessTable;
@@ -59,10 +60,73 @@ pub struct LateDemand {
 /// From when on calls of a callback are late.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RequestedBound {
-    /// Topic that triggers the callback, or its node; `None` = any callback.
-    pub name: Option<Arc<str>>,
+    /// Callbacks that have it.
+    pub of: BoundScope,
     /// Maximum time of a call, and maximum time from ready to start.
     pub above: Duration,
+}
+
+/// Which callbacks have a bound.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum BoundScope {
+    /// Any callback.
+    All,
+    /// Callbacks of topics that the pattern of a watch covers.
+    Topics {
+        /// ROS name or glob.
+        pattern: Arc<str>,
+        /// Domain; `None` = any.
+        domain_id: Option<DomainId>,
+    },
+    /// Callbacks of a topic, service or node with this ROS name, and those that are known to belong
+    /// to the node.
+    Named {
+        /// ROS name.
+        name: Arc<str>,
+        /// Domain; `None` = any.
+        domain_id: Option<DomainId>,
+        /// Process and address of callbacks.
+        listed: Arc<BTreeSet<(u32, u64)>>,
+    },
+    /// These callbacks, by process and address.
+    Listed(Arc<BTreeSet<(u32, u64)>>),
+}
+
+/// What is known about a callback.
+struct CallbackNames {
+    handle: Handle,
+    domain_id: DomainId,
+    trigger: Trigger,
+    node: Option<NodeName>,
+}
+
+impl BoundScope {
+    fn has(&self, callback: &CallbackNames) -> bool {
+        let id = (callback.handle.process, callback.handle.address);
+        let is_in = |domain_id: &Option<DomainId>| {
+            domain_id.is_none_or(|domain_id| domain_id == callback.domain_id)
+        };
+        match self {
+            Self::All => true,
+            Self::Topics { pattern, domain_id } => {
+                let topic = match &callback.trigger {
+                    Trigger::Subscription(topic) | Trigger::IntraProcess(Some(topic)) => topic,
+                    _ => return false,
+                };
+                is_in(domain_id) && glob::covers(pattern, topic)
+            }
+            Self::Named {
+                name,
+                domain_id,
+                listed,
+            } => {
+                let name = Some(&**name);
+                let is_named = name == callback.trigger.name() || name == callback.node.as_deref();
+                listed.contains(&id) || is_named && is_in(domain_id)
+            }
+            Self::Listed(listed) => listed.contains(&id),
+        }
+    }
 }
 
 /// What the programs observe about late calls.
@@ -235,7 +299,16 @@ impl LateObservation {
         for (handle, figures) in &callbacks {
             let requested = match &self.requested[..] {
                 [] => None,
-                requested => bound_of(requested, &table.name_callback(*handle, figures)),
+                requested => {
+                    let (trigger, node) = table.name_callback(*handle, figures);
+                    let callback = CallbackNames {
+                        handle: *handle,
+                        domain_id: table.domain_of(handle.process),
+                        trigger,
+                        node,
+                    };
+                    bound_of(requested, &callback)
+                }
             };
             let learnt = self.bounds.get_or_insert_with(*handle, Learnt::default);
             let Some(learnt) = learnt else {
@@ -246,7 +319,7 @@ impl LateObservation {
                 Some(above) => Some([above; 2]),
                 None => learnt.learnt,
             };
-            if learnt.differs(bounds) {
+            if learnt.differs(bounds, requested.is_some()) {
                 let set = match bounds {
                     Some([duration, delay]) => {
                         let bound = Bound {
@@ -267,13 +340,9 @@ impl LateObservation {
 }
 
 /// Returns the bound of a callback, in nanoseconds, if one applies.
-fn bound_of(requested: &[RequestedBound], of: &(Trigger, Option<NodeName>)) -> Option<u64> {
-    let (trigger, node) = of;
-    let applies = |bound: &&RequestedBound| {
-        let name = bound.name.as_deref();
-        name.is_none() || name == trigger.name() || name == node.as_deref()
-    };
-    let above = requested.iter().find(applies)?.above;
+fn bound_of(requested: &[RequestedBound], callback: &CallbackNames) -> Option<u64> {
+    let mut requested = requested.iter();
+    let above = requested.find(|bound| bound.of.has(callback))?.above;
     Some(u64::try_from(above.as_nanos()).unwrap_or(u64::MAX))
 }
 
@@ -332,10 +401,11 @@ impl Learnt {
         Some([bound(duration, durations)?, delay])
     }
 
-    /// Returns whether bounds differ from those that the programs have by more than a step of the
-    /// distribution.
-    fn differs(&self, bounds: Option<[u64; 2]>) -> bool {
+    /// Returns whether bounds differ from those that the programs have: learnt ones by more than a
+    /// step of the distribution.
+    fn differs(&self, bounds: Option<[u64; 2]>, is_requested: bool) -> bool {
         match (self.set, bounds) {
+            (Some(set), Some(bounds)) if is_requested => set != bounds,
             (Some(set), Some(bounds)) => {
                 let both = set.iter().zip(&bounds);
                 both.clone()
@@ -691,29 +761,65 @@ mod tests {
 
     #[test]
     fn the_first_bound_that_applies_to_a_callback_counts() {
-        let bound = |name: Option<&str>, milliseconds| RequestedBound {
-            name: name.map(Arc::from),
+        let bound = |of: BoundScope, milliseconds| RequestedBound {
+            of,
             above: Duration::from_millis(milliseconds),
         };
-        let requested = [
-            bound(Some("/scan"), 1),
-            bound(Some("/nav"), 2),
-            bound(Some("/scan"), 3),
-        ];
-        let of = |topic: &str, node: &str| {
-            bound_of(
-                &requested,
-                &(Trigger::Subscription(topic.into()), Some(node.into())),
-            )
+        let named = |name: &str, listed: &[(u32, u64)]| BoundScope::Named {
+            name: name.into(),
+            domain_id: None,
+            listed: Arc::new(listed.iter().copied().collect()),
         };
-        assert_eq!(of("/scan", "/nav"), Some(1_000_000));
-        assert_eq!(of("/map", "/nav"), Some(2_000_000));
-        assert_eq!(of("/map", "/other"), None);
-        let all = [bound(None, 4)];
-        assert_eq!(
-            bound_of(&all, &(Trigger::Timer(None), None)),
-            Some(4_000_000)
-        );
+        let topics = |pattern: &str, domain_id| BoundScope::Topics {
+            pattern: pattern.into(),
+            domain_id: Some(DomainId(domain_id)),
+        };
+        let requested = [
+            bound(named("/scan", &[]), 1),
+            bound(named("/nav", &[(2, 7)]), 2),
+            bound(named("/scan", &[]), 3),
+            bound(topics("/camera/**", 0), 4),
+            bound(topics("/camera/**", 5), 5),
+            bound(BoundScope::Listed(Arc::new([(2, 8)].into())), 6),
+        ];
+        let callback = |address, domain_id, topic: &str, node: &str| CallbackNames {
+            handle: Handle {
+                address,
+                process: 2,
+                kind: kind::CALLBACK,
+            },
+            domain_id: DomainId(domain_id),
+            trigger: Trigger::Subscription(topic.into()),
+            node: Some(node.into()),
+        };
+        let of = |callback| bound_of(&requested, &callback).map(|bound| bound / 1_000_000);
+        assert_eq!(of(callback(1, 0, "/scan", "/nav")), Some(1));
+        assert_eq!(of(callback(1, 0, "/map", "/nav")), Some(2));
+        assert_eq!(of(callback(1, 0, "/map", "/other")), None);
+        // The graph knows the node of this one.
+        assert_eq!(of(callback(7, 0, "/map", "/other")), Some(2));
+        assert_eq!(of(callback(8, 0, "/map", "/other")), Some(6));
+        assert_eq!(of(callback(1, 0, "/camera/front/image", "/other")), Some(4));
+        assert_eq!(of(callback(1, 5, "/camera/front/image", "/other")), Some(5));
+        assert_eq!(of(callback(1, 6, "/camera/front/image", "/other")), None);
+        let timer = CallbackNames {
+            trigger: Trigger::Timer(None),
+            ..callback(1, 0, "", "/other")
+        };
+        let all = [bound(BoundScope::All, 4)];
+        assert_eq!(bound_of(&all, &timer), Some(4_000_000));
+    }
+
+    #[test]
+    fn a_requested_bound_is_exact_and_a_learnt_one_changes_by_a_step() {
+        let learnt = Learnt {
+            set: Some([5_400_000; 2]),
+            ..Learnt::default()
+        };
+        let new = Some([5_000_000; 2]);
+        assert!(learnt.differs(new, true) && !learnt.differs(new, false));
+        assert!(!learnt.differs(learnt.set, true));
+        assert!(learnt.differs(None, false));
     }
 
     #[test]

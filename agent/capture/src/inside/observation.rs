@@ -191,7 +191,7 @@ impl Observation {
             last_round: now,
             last_review: now,
             is_broker_unavailable: false,
-            has_lost_events: false,
+            has_lost_events: true,
         }
     }
 
@@ -252,14 +252,16 @@ impl Observation {
         let found = self.processes.find(self.has_lost_events, broker);
         let failed = found.err().map(|error| in_words(&error));
         if failed.is_none() {
-            if self.mappings.is_none() {
+            let were_open = self.mappings.is_some();
+            if !were_open {
                 self.mappings = MappingEvents::open_or_warn(
                     "capture.inside",
                     broker,
                     &mut self.without_mappings,
                 );
             }
-            self.has_lost_events &= self.mappings.is_none();
+            // A process may have mapped a library before the events were open.
+            self.has_lost_events = !were_open && self.mappings.is_some();
             self.probes.install(to_calls, now, broker);
         }
         self.probes.follow(&self.processes, to_calls, now, broker);
@@ -363,13 +365,15 @@ impl Observation {
             std::thread::sleep(UNRELATED_DELAY);
             return;
         }
-        // A broker that does not answer is reported in the next round.
         let met: Result<(), BrokerError> = self.processes.inspect_mapped(&new, &mut self.broker);
-        if met.is_ok() {
-            let to_calls = !self.is_resting && self.suspended_at.is_none();
-            let now = Instant::now();
-            (self.probes).follow(&self.processes, to_calls, now, &mut self.broker);
+        if met.is_err() {
+            // A broker that does not answer is reported in the next round.
+            self.has_lost_events = true;
+            return;
         }
+        let to_calls = !self.is_resting && self.suspended_at.is_none();
+        let now = Instant::now();
+        (self.probes).follow(&self.processes, to_calls, now, &mut self.broker);
     }
 
     fn take_mapped(&mut self) -> NewMappings {

@@ -17,7 +17,7 @@ use ros2probe_attach::client::Broker;
 use ros2probe_attach::functions::{Calls, ENQUEUE};
 use ros2probe_attach::request::Place;
 use ros2probe_wire::inside::late::{self, Activity, Blocked, Bound, Handoff};
-use ros2probe_wire::inside::{Counter, Figures, Handle, Process, accounting, clock};
+use ros2probe_wire::inside::{Counter, Figures, Handle, Process, accounting, clock, kind};
 use zerocopy::FromZeros as _;
 
 use crate::bpf;
@@ -48,6 +48,8 @@ type BoundWords = [u64; size_of::<Bound>() / 8];
 type FollowedWords = [u64; 24 + FOLLOWED_STATES + 15];
 const FOLLOWED_STATES: usize =
     (2 * (size_of::<Blocked>() + size_of::<Activity>()) + size_of::<Handoff>()) / 8;
+/// Flag of an update that creates no entry (BPF_EXIST, bpf(2)).
+const EXISTING: u64 = 2;
 /// The first word of a followed thread that can run and does not.
 const RUNNABLE: u64 = 1;
 /// Number of comparisons in a row after which a wrong number of runnable threads is corrected.
@@ -339,6 +341,38 @@ impl Tables {
         }
         clear(&mut self.threads).map_err(failed("THREADS", "remove"))?;
         clear(&mut self.waiting).map_err(failed("WAITING", "remove"))
+    }
+
+    /// Forgets the minimum delay of each subscription's messages, from which waits are computed: the
+    /// wall clock was set.
+    ///
+    /// # Errors
+    /// Fails if the kernel refuses an update.
+    pub fn forget_delays(&mut self) -> Result<(), FilterError> {
+        let handles = self.figures().map(|(handle, _)| handle);
+        let subscriptions = handles.filter(|handle| handle.kind == kind::SUBSCRIPTION);
+        let subscriptions: Vec<_> = subscriptions.collect();
+        for handle in subscriptions {
+            let key: HandleWords = zerocopy::transmute!(handle);
+            // The programs may count meanwhile, so the time between read and write must be short.
+            let Ok(words) = self.handles.get(&key, 0) else {
+                continue;
+            };
+            let mut figures: Figures = zerocopy::transmute!(words);
+            let [_, delay] = &mut figures.minima;
+            if std::mem::take(delay) == 0 {
+                continue;
+            }
+            let words: FiguresWords = zerocopy::transmute!(figures);
+            match self.handles.insert(key, words, EXISTING) {
+                // The subscription was destroyed.
+                Ok(()) | Err(MapError::ElementNotFound | MapError::KeyNotFound) => {}
+                Err(MapError::SyscallError(error))
+                    if error.io_error.kind() == io::ErrorKind::NotFound => {}
+                Err(error) => return Err(failed("HANDLES", "update")(error)),
+            }
+        }
+        Ok(())
     }
 
     /// Forgets when the calls of a process happened, or with `None` those of all processes, while the

@@ -177,7 +177,7 @@ impl<P> Attachments<P> {
             library.probe = Err(Reason(CHANGED.to_owned()));
             library.retried = now + SETTLING_TIME;
         }
-        if is_any_installed {
+        if is_any_installed || detached {
             self.next_search = Some(now + SETTLING_TIME);
             self.searched_until = now + UPGRADE_TIME;
         }
@@ -200,13 +200,22 @@ impl<P> Attachments<P> {
             let (Some(version), Ok(id)) = (Version::of(&path), id_as_mapped(&path)) else {
                 continue;
             };
-            match self.libraries.get(&id) {
-                Some(known) if !known.is_installed || known.probe.is_ok() => continue,
+            let is_full = self.libraries.is_full();
+            match self.libraries.get_mut(&id) {
+                Some(known) if known.probe.is_ok() => {
+                    if !known.is_installed {
+                        (known.path, known.version) = (path, Some(version));
+                        known.is_installed = true;
+                    }
+                    continue;
+                }
+                // The process that uses it leads to the next attempt.
+                Some(known) if known.processes > 0 => continue,
                 Some(known) if now < known.retried => {
                     self.next_search = Some(known.retried);
                     continue;
                 }
-                None if self.libraries.is_full() => continue,
+                None if is_full => continue,
                 Some(_) | None => {}
             }
             match (self.attach)(broker, Place::Installed(path.clone())) {
@@ -522,10 +531,13 @@ mod tests {
             version: None,
             is_installed: true,
         };
-        attachments.libraries.insert(id(1), library);
+        attachments
+            .libraries
+            .insert(id_as_mapped(&path).unwrap(), library);
         attachments.next_search = Some(start);
         attachments.searched_until = start + UPGRADE_TIME;
         let mut searches = 0;
+        let before = attempts.load(Ordering::Relaxed);
         for second in 0..600 {
             let now = start + Duration::from_secs(second);
             if attachments.is_search_due(now) {
@@ -535,6 +547,7 @@ mod tests {
             attachments.follow(&processes(0), now, broker);
         }
         assert_eq!(searches, 13);
+        assert_eq!(attempts.load(Ordering::Relaxed) - before, searches);
         assert!(attachments.is_installed());
         assert!(attachments.libraries.is_empty());
     }
@@ -564,6 +577,10 @@ mod tests {
         }
         fs::write(&path, "second").unwrap();
         assert!(attachments.detach_changed(start));
+        assert!(
+            attachments.is_search_due(start + SETTLING_TIME),
+            "attached again"
+        );
         assert!(attachments.probe(&id(inode)).is_some_and(Result::is_err));
         assert!(attachments.probe(&id(inode + 1)).is_some_and(Result::is_ok));
     }

@@ -70,15 +70,16 @@ pub(crate) struct Why {
 impl Why {
     pub(crate) fn run(self) -> Result<ExitCode> {
         let agent = Agent::reach(&self.target)?;
-        let path = self.path()?;
+        let begin = Instant::now();
         let end = Instant::now() + Duration::from_secs(self.wait);
         let mut has_said = false;
         let answer = loop {
+            let now = Instant::now();
+            let path = self.path(now.saturating_duration_since(begin))?;
             let answer: Answer<'static> = match self.json {
                 true => agent.get(&path)?,
                 false => agent.get_visible(&path)?,
             };
-            let now = Instant::now();
             if !why::is_empty(&answer) || answer.observed == "off" || now >= end {
                 break answer;
             }
@@ -89,7 +90,8 @@ impl Why {
             std::thread::sleep(POLL_INTERVAL);
         };
         if self.json {
-            return print_text(&(serde_json::to_string_pretty(&answer)? + "\n"));
+            print_text(&(serde_json::to_string_pretty(&answer)? + "\n"))?;
+            return Ok(ExitCode::from(u8::from(why::is_empty(&answer))));
         }
         if why::is_empty(&answer) {
             return Err(UserError(self.no_late_calls(&answer)).into());
@@ -97,7 +99,9 @@ impl Why {
         print_text(&why::text(&answer, &TimeZone::system()))
     }
 
-    fn path(&self) -> Result<String> {
+    /// Returns the path of a request, `since` the command began. A bound says nothing about earlier
+    /// calls.
+    fn path(&self, since: Duration) -> Result<String> {
         let mut parameters = Vec::new();
         if let Some(name) = self.name.as_ref().or(self.node.as_ref()) {
             parameters.push(format!("name={}", encoded(name)));
@@ -115,6 +119,8 @@ impl Why {
                 return Err(UserError(text.to_owned()).into());
             }
             parameters.push(format!("last_s={seconds}"));
+        } else if self.above.is_some() && self.wait > 0 {
+            parameters.push(format!("last_s={:.1}", since.as_secs_f64()));
         }
         Ok(match parameters.is_empty() {
             true => "/why".to_owned(),

@@ -249,6 +249,19 @@ fn calls_are_observed_while_a_client_requests_them_and_names_always() -> Result<
     Ok(())
 }
 
+/// Returns the answer of `rp why` at once. Its exit code is 1 if no call was late.
+fn why(socket: &Path, options: &str) -> Result<Why<'static>> {
+    let mut command = Command::new(RP);
+    command.arg("why").args(options.split_whitespace());
+    command.args(["--json", "--wait", "0", "--socket"]);
+    let output = command.arg(socket).output()?;
+    let expected = serde_json::from_slice::<Why<'static>>(&output.stdout)
+        .with_context(|| format!("{output:?}"))?;
+    let code = i32::from(expected.callbacks.is_empty());
+    ensure!(output.status.code() == Some(code), "{output:?}");
+    Ok(expected)
+}
+
 #[test]
 fn an_unreceived_message_is_late_in_its_socket() -> Result<()> {
     let host = Namespace::isolated()?;
@@ -280,8 +293,7 @@ fn an_unreceived_message_is_late_in_its_socket() -> Result<()> {
             process.write_line("network 1 0")?;
             process.line_with_end("network", PATIENCE)?;
         }
-        let answer = ask("/in --json --wait 0 --above 30")?;
-        let mut answer: Why<'static> = serde_json::from_str(&answer)?;
+        let mut answer = why(&socket, "/in --above 30")?;
         late = answer.callbacks.pop();
         let in_socket = |late: &LateCallback<'_>| {
             let causes = late.examples.iter().map(|call| (&call.stage, &call.cause));
@@ -328,10 +340,7 @@ fn a_sleeping_call_is_late_with_its_cause_from_the_first_request_on() -> Result<
     let mut process = Process::start(&host.inside(), program.program(), arguments)?;
     let socket = directory.path().join("api.sock");
     let ask = |options: &str| run(&format!("{RP} why {options} --socket {}", socket.display()));
-    let why = |options: &str| -> Result<Why<'static>> {
-        let text = ask(&format!("--json --wait 0 {options}"))?;
-        Ok(serde_json::from_str(&text)?)
-    };
+    let why = |options: &str| why(&socket, options);
     // The first question begins the observation of calls, and later that of the scheduler.
     wait_until("the scheduler is observed", || {
         let answer = why("--above 5")?;

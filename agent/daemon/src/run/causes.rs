@@ -4,7 +4,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use ros2probe_capture::inside::late::{LateDemand, RequestedBound};
+use ros2probe_capture::inside::late::{BoundScope, LateDemand, RequestedBound};
 use ros2probe_model::facts::diagnosis::Diagnosis;
 use ros2probe_model::facts::event::{Event, EventKind};
 use ros2probe_model::facts::watch::{Watch, WatchState};
@@ -22,16 +22,19 @@ pub(super) struct CauseDemand {
 }
 
 impl CauseDemand {
-    /// Takes the maximum latencies of topics that watches name.
+    /// Takes the maximum latencies of watches. The smallest one that applies to a topic counts.
     pub(super) fn take_watches(&mut self, watches: &[Arc<Watch>]) {
-        let named = watches.iter().filter(|watch| watch.is_literal());
-        let expected = named.filter_map(|watch| {
+        let expected = watches.iter().filter_map(|watch| {
             Some(RequestedBound {
-                name: Some(Arc::from(watch.pattern.as_str())),
+                of: BoundScope::Topics {
+                    pattern: Arc::from(watch.pattern.as_str()),
+                    domain_id: watch.domain_id,
+                },
                 above: watch.expectations.max_latency?,
             })
         });
         self.expected = expected.collect();
+        self.expected.sort_by_key(|bound| bound.above);
     }
 
     /// Notes the events that require causes.

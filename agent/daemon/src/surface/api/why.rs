@@ -1,7 +1,7 @@
 //! `/why`: late calls of callbacks.
 
 use std::borrow::Cow;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -24,12 +24,14 @@ use ros2probe_api::chains::{Chain, Hop};
 use ros2probe_api::why::{
     Blocked, Cause, LateCall, LateCallSummary, LateCallback, OtherThread, Part, PreviousCall, Why,
 };
+use ros2probe_capture::inside::late::{BoundScope, RequestedBound};
 use ros2probe_model::facts::calls::facts::{self, InsideFacts, LateExample};
 use ros2probe_model::facts::calls::report::Trigger;
 use ros2probe_model::facts::calls::{late, other_thread};
 use ros2probe_model::facts::model_time::ModelTime;
 use ros2probe_model::facts::wall_clock::WallClock;
 use ros2probe_model::report::snapshot::Snapshot;
+use ros2probe_wire::DomainId;
 
 /// Longest bound that a request may set, in milliseconds.
 const LONGEST_MS: f64 = 3_600_000.0;
@@ -67,6 +69,31 @@ struct Of {
     history: bool,
 }
 
+impl Of {
+    /// Returns what tells this request from those about other callbacks.
+    fn key(&self) -> Option<String> {
+        let domain = self.domain_id.map(|id| id.to_string());
+        let parts = [&domain, &self.name, &self.from, &self.to];
+        let is_any = parts.iter().any(|part| part.is_some());
+        let parts = parts.map(|part| part.as_deref().unwrap_or_default());
+        is_any.then(|| parts.join(" "))
+    }
+
+    /// Returns which callbacks have the requested bound. Those in `listed` are meant and known.
+    fn scope(&self, listed: BTreeSet<(u32, u64)>) -> BoundScope {
+        let listed = Arc::new(listed);
+        match (&self.name, &self.from, &self.to, self.domain_id) {
+            (None, None, None, None) => BoundScope::All,
+            (Some(name), None, None, domain_id) => BoundScope::Named {
+                name: Arc::from(name.as_str()),
+                domain_id: domain_id.map(DomainId),
+                listed,
+            },
+            _ => BoundScope::Listed(listed),
+        }
+    }
+}
+
 pub(super) fn routes() -> OpenApiRouter<Context> {
     OpenApiRouter::new().routes(routes!(show))
 }
@@ -97,21 +124,31 @@ async fn show(
         .last_s
         .map(|last| number_in_range("last_s", last, LONGEST_S));
     let last = last.transpose()?.map(Duration::from_secs_f64);
-    context.latest.request_late_calls(of.name.as_deref(), above);
+    let key = of.key();
+    context.latest.request_late_calls(key.as_deref(), None);
     let state = context.state().await;
     let snapshot = state.known();
     let source = state.agent.inside.as_ref();
     let ends = (of.from.as_deref(), of.to.as_deref());
     let chains =
         (ends != (None, None)).then(|| parts(snapshot.chains.chains.iter(), ends.0, ends.1));
-    let is_meant = |callback: &facts::LateCallback| {
+    let is_meant = |owner: &facts::Owner, trigger: &Trigger| {
         let name = of.name.as_deref();
-        domain.admits(callback.owner.domain_id)
-            && (chains.as_ref()).is_none_or(|chains| is_in_any(chains, callback))
-            && (name.is_none()
-                || name == callback.trigger.name()
-                || name == callback.owner.node.as_deref())
+        domain.admits(owner.domain_id)
+            && (chains.as_ref()).is_none_or(|chains| is_in_any(chains, owner, trigger))
+            && (name.is_none() || name == trigger.name() || name == owner.node.as_deref())
     };
+    if let Some(above) = above {
+        let known = snapshot.inside.iter().flat_map(|inside| &inside.callbacks);
+        let meant = known.filter(|callback| is_meant(&callback.owner, &callback.trigger));
+        let listed = meant.map(|callback| (callback.owner.process, callback.owner.handle));
+        let bound = RequestedBound {
+            of: of.scope(listed.collect()),
+            above,
+        };
+        (context.latest).request_late_calls(key.as_deref(), Some(bound));
+    }
+    let is_meant = |callback: &facts::LateCallback| is_meant(&callback.owner, &callback.trigger);
     let selection = Selection {
         last,
         has_history: of.history,
@@ -121,9 +158,9 @@ async fn show(
 
 /// Returns whether a callback handles messages of one of these chains, or is a timer of one of their
 /// nodes. A timer may publish what a callback has kept.
-fn is_in_any(chains: &[Chain<'_>], callback: &facts::LateCallback) -> bool {
-    let node = callback.owner.node.as_deref();
-    let is_in = |hop: &Hop<'_>| match &callback.trigger {
+fn is_in_any(chains: &[Chain<'_>], owner: &facts::Owner, trigger: &Trigger) -> bool {
+    let node = owner.node.as_deref();
+    let is_in = |hop: &Hop<'_>| match trigger {
         Trigger::Subscription(topic) | Trigger::IntraProcess(Some(topic)) => {
             let is_other = |(one, other)| one != other;
             **topic == *hop.input && !node.zip(hop.node.as_deref()).is_some_and(is_other)
@@ -133,7 +170,7 @@ fn is_in_any(chains: &[Chain<'_>], callback: &facts::LateCallback) -> bool {
     };
     chains
         .iter()
-        .any(|chain| chain.domain_id == callback.owner.domain_id.0 && chain.hops.iter().any(is_in))
+        .any(|chain| chain.domain_id == owner.domain_id.0 && chain.hops.iter().any(is_in))
 }
 
 /// Returns a number from 0 to `largest`, or the problem of another one.
@@ -257,7 +294,10 @@ fn late_callback<'a>(
     LateCallback {
         owner: owner(&callback.owner),
         trigger: trigger(&callback.trigger),
-        calls: of.map(|of| of.calls),
+        // Its calls are counted anew after a rest.
+        calls: of
+            .map(|of| of.calls)
+            .filter(|calls| *calls >= callback.calls),
         late_calls: callback.calls,
         parts: (callback.sums.iter())
             .map(|((stage, cause), sum)| part(*stage, *cause, *sum))
@@ -394,7 +434,7 @@ mod tests {
             let mut callback = known.late[0].clone();
             callback.owner.node = node.map(Into::into);
             callback.trigger = trigger;
-            is_in_any(&chains, &callback)
+            is_in_any(&chains, &callback.owner, &callback.trigger)
         };
         let points = || Trigger::Subscription("/points".into());
         let timer = || Trigger::Timer(None);
@@ -412,10 +452,13 @@ mod tests {
         // A chain of another domain, and the part that does not reach the node.
         let mut other = known.late[0].clone();
         other.owner.node = Some("/filter".into());
-        assert!(is_in_any(&chains, &other));
+        let is_other_in =
+            |other: &facts::LateCallback| is_in_any(&chains, &other.owner, &other.trigger);
+        assert!(is_other_in(&other));
         other.owner.domain_id.0 += 1;
-        assert!(!is_in_any(&chains, &other));
+        assert!(!is_other_in(&other));
         let last = parts(all, Some("/filtered"), None);
-        assert!(!is_in_any(&last, &known.late[0]));
+        let late = &known.late[0];
+        assert!(!is_in_any(&last, &late.owner, &late.trigger));
     }
 }
