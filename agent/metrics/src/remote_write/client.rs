@@ -49,6 +49,8 @@ pub(super) enum WriteResult {
     Accepted,
     /// The request may succeed later; at the earliest after this time.
     RetryLater(String, Option<Duration>),
+    /// No answer arrived in time. On a slow link, a smaller request may succeed.
+    Late,
     /// The receiver refuses these samples. It wrote this number of them, if it knows.
     Refused(String, Option<u64>),
     /// The receiver does not know this version.
@@ -101,7 +103,7 @@ impl Client {
         match timeout(self.settings.timeout, answered).await {
             Ok(Ok(response)) => answer(&response, version),
             Ok(Err(reason)) => WriteResult::RetryLater(reason, None),
-            Err(_) => WriteResult::RetryLater("no answer in time".to_owned(), None),
+            Err(_) => WriteResult::Late,
         }
     }
 

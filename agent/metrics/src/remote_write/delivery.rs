@@ -104,6 +104,9 @@ struct State {
     is_closed: bool,
 }
 
+/// Reason in the log for a request without an answer.
+const LATE: &str = "no answer in time";
+
 /// Requests to the receiver, and what is known about it.
 struct Sender<'a> {
     job: &'a Job,
@@ -117,6 +120,16 @@ struct Sender<'a> {
     is_refusal_logged: bool,
     /// Whether a replaced file could not be used at the last request.
     has_unusable_file: bool,
+    /// Number of collections in a request that the link seems to carry in time.
+    carried: usize,
+}
+
+/// Samples that the receiver did not write.
+enum Unwritten {
+    /// It did not answer in time, and a smaller request may succeed.
+    Late,
+    /// It refused them for this reason, and wrote this number of them.
+    Refused(String, Option<u64>),
 }
 
 impl Waiting {
@@ -163,15 +176,7 @@ impl Job {
             let mut state = self.waiting.state();
             state.backlog.open(&directory, self.settings.queue_bytes);
         }
-        let sender = Sender {
-            job: &self,
-            client,
-            version: Version::Two,
-            is_known: false,
-            is_working: None,
-            is_refusal_logged: false,
-            has_unusable_file: false,
-        };
+        let sender = Sender::new(&self, client);
         let deliver = async {
             tokio::select! {
                 () = sender.run() => {}
@@ -248,7 +253,20 @@ impl Job {
     }
 }
 
-impl Sender<'_> {
+impl<'a> Sender<'a> {
+    const fn new(job: &'a Job, client: Client) -> Self {
+        Self {
+            job,
+            client,
+            version: Version::Two,
+            is_known: false,
+            is_working: None,
+            is_refusal_logged: false,
+            has_unusable_file: false,
+            carried: usize::MAX,
+        }
+    }
+
     /// Sends samples until none can follow.
     async fn run(mut self) {
         loop {
@@ -263,37 +281,43 @@ impl Sender<'_> {
 
     /// Sends samples until the receiver has written or refused each of them.
     async fn settle(&mut self, batch: &[Arc<Scrape>]) {
-        // A receiver that refuses some samples may refuse the whole request, so parts follow.
-        let mut parts = vec![batch];
+        // The oldest samples are in the last part.
+        let mut parts: Vec<_> = batch.chunks(self.carried).rev().collect();
         while let Some(part) = parts.pop() {
             match self.send_until_settled(part).await {
                 Ok(()) => self
                     .job
                     .figures
                     .count_samples(SampleFate::Delivered, samples(part)),
-                Err((_, None)) if part.len() > 1 => {
+                // A receiver that refuses some samples may refuse the whole request.
+                Err(Unwritten::Refused(_, None)) if part.len() > 1 => {
                     let (older, newer) = part.split_at(part.len() / 2);
                     parts.extend([newer, older]);
                 }
-                Err((reason, written)) => {
+                Err(Unwritten::Late) => {
+                    self.carried = (part.len() / 2).max(1);
+                    parts.push(part);
+                    let smaller = parts.iter();
+                    let smaller = smaller.flat_map(|part| part.chunks(self.carried).rev());
+                    parts = smaller.collect();
+                }
+                Err(Unwritten::Refused(reason, written)) => {
                     self.refused(&reason, samples(part), written.unwrap_or(0));
                 }
             }
         }
     }
 
-    /// Sends samples until the receiver writes or refuses them. An error has its reason, and the
-    /// number of samples that the receiver wrote.
-    async fn send_until_settled(
-        &mut self,
-        part: &[Arc<Scrape>],
-    ) -> Result<(), (String, Option<u64>)> {
+    /// Sends samples until the receiver writes or refuses them. A single collection is repeated when
+    /// no answer arrives in time.
+    async fn send_until_settled(&mut self, part: &[Arc<Scrape>]) -> Result<(), Unwritten> {
         let mut pause = FIRST_PAUSE;
         let mut body = self.body(part);
         let mut is_doubted = false;
         loop {
             self.reload_files();
             let length = body.len();
+            let begun = Instant::now();
             let answer = match self.client.send(body.clone(), self.version).await {
                 // A receiver of version 2.0 states it, but the portal of a network does not.
                 WriteResult::Unconfirmed if self.is_known => {
@@ -301,6 +325,13 @@ impl Sender<'_> {
                     WriteResult::RetryLater(reason.to_owned(), None)
                 }
                 WriteResult::Unconfirmed => WriteResult::UnknownVersion,
+                WriteResult::Late if part.len() > 1 => {
+                    self.job.figures.count_request(Request::Retried, length);
+                    self.failed(LATE);
+                    sleep(pause).await;
+                    return Err(Unwritten::Late);
+                }
+                WriteResult::Late => WriteResult::RetryLater(LATE.to_owned(), None),
                 // Only a second refusal shows that another receiver took its place.
                 WriteResult::UnknownVersion
                     if self.is_known && !std::mem::replace(&mut is_doubted, true) =>
@@ -325,6 +356,10 @@ impl Sender<'_> {
                 WriteResult::Accepted => {
                     figures.count_request(Request::Delivered, length);
                     self.delivered();
+                    let was_fast = begun.elapsed() < self.job.settings.timeout / 4;
+                    if was_fast && part.len() >= self.carried {
+                        self.carried = self.carried.saturating_mul(2);
+                    }
                     self.limit(length).await;
                     return Ok(());
                 }
@@ -332,8 +367,9 @@ impl Sender<'_> {
                     figures.count_request(Request::Refused, length);
                     self.job.waiting.state().fails = false;
                     self.limit(length).await;
-                    return Err((reason, written));
+                    return Err(Unwritten::Refused(reason, written));
                 }
+                WriteResult::Late => {}
                 WriteResult::RetryLater(reason, demanded) => {
                     figures.count_request(Request::Retried, length);
                     self.failed(&reason);
@@ -415,7 +451,94 @@ fn samples(part: &[Arc<Scrape>]) -> u64 {
 
 #[cfg(test)]
 mod tests {
+    use std::io::{BufRead as _, BufReader, Read as _, Write as _};
+    use std::net::{TcpListener, TcpStream};
+
+    use super::super::settings::RemoteWriteSettings;
     use super::*;
+    use crate::otlp::{Host, ReadText};
+
+    /// Earlier, the same request was repeated for ever, and nothing arrived any more.
+    #[test]
+    fn a_backlog_passes_a_link_that_carries_only_small_requests_in_time() {
+        const CARRIED_BYTES: usize = 2500;
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let address = listener.local_addr().unwrap();
+        std::thread::spawn(move || {
+            for stream in listener.incoming() {
+                let stream = stream.unwrap();
+                std::thread::spawn(move || answer_small(stream, CARRIED_BYTES));
+            }
+        });
+        let file = RemoteWriteSettings {
+            url: Some(format!("http://{address}/write")),
+            timeout: Duration::from_millis(500),
+            ..RemoteWriteSettings::default()
+        };
+        let read: ReadText = |_, _| Err(std::io::ErrorKind::NotFound.into());
+        let settings = Settings::resolve(&file, read, &Host::default());
+        let settings = Arc::new(settings.unwrap().unwrap());
+        let client = Client::new(Arc::clone(&settings)).unwrap();
+        let job = Job {
+            waiting: Waiting::default(),
+            figures: Arc::default(),
+            stop: CancellationToken::new(),
+            settings,
+        };
+        let mut sender = Sender::new(&job, client);
+        // Names that do not compress: some collections fit.
+        let mut random = 1_u64;
+        let mut letter = || {
+            random = random
+                .wrapping_mul(6_364_136_223_846_793_005)
+                .wrapping_add(1);
+            b'a' + u8::try_from((random >> 33) % 26).unwrap()
+        };
+        let mut scrape = |number: i64| {
+            let name = (0..600).map(|_| letter());
+            let name: Vec<u8> = [b'g'].into_iter().chain(name).chain([0xff]).collect();
+            Arc::new(Scrape {
+                at: now() + number,
+                samples: vec![(name.into(), 0.0)],
+            })
+        };
+        let batch: Vec<_> = (0..20).map(&mut scrape).collect();
+        let runtime = Builder::new_current_thread().enable_all().build().unwrap();
+        runtime.block_on(sender.settle(&batch));
+        assert_eq!(job.figures.samples(SampleFate::Delivered), 20);
+        assert!(job.figures.requests(Request::Retried) >= 1);
+    }
+
+    /// Answers requests of a connection; larger ones only when the client has given up.
+    fn answer_small(mut stream: TcpStream, carried: usize) {
+        let mut reader = BufReader::new(stream.try_clone().unwrap());
+        loop {
+            let mut length = 0;
+            loop {
+                let mut line = String::new();
+                if reader.read_line(&mut line).unwrap_or(0) == 0 {
+                    return;
+                }
+                if let Some(value) = line.to_ascii_lowercase().strip_prefix("content-length:") {
+                    length = value.trim().parse().unwrap();
+                }
+                if line == "\r\n" {
+                    break;
+                }
+            }
+            let mut body = vec![0; length];
+            reader.read_exact(&mut body).unwrap();
+            if length > carried {
+                std::thread::sleep(Duration::from_secs(1));
+                return;
+            }
+            let answer = "HTTP/1.1 204 No Content\r\nX-Prometheus-Remote-Write-Samples-Written: \
+                          1\r\n\r\n";
+            if stream.write_all(answer.as_bytes()).is_err() {
+                return;
+            }
+        }
+    }
 
     #[test]
     fn the_age_of_waiting_samples_falls_while_a_queue_on_disk_is_drained() {
