@@ -153,7 +153,14 @@ impl Store {
             }
             _ => Blocks::create(self.free_path(tier, begin), begin)?,
         };
-        file.append(blocks)?;
+        match file.append(blocks) {
+            // Somebody has deleted the file to gain space.
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {
+                file = Blocks::create(self.free_path(tier, begin), begin)?;
+                file.append(blocks)?;
+            }
+            appended => appended?,
+        }
         // A slow storage must not hold the lock, for which readers would wait.
         for excess in self.replace_last(tier, file, budget) {
             let _ = fs::remove_file(excess.path);
@@ -293,6 +300,14 @@ impl Store {
         })
     }
 
+    /// Returns the begin of the first file of a tier that ends after a time; `None` without one.
+    #[must_use]
+    pub fn begin_after(&self, tier: Tier, time: u32) -> Option<u32> {
+        let files = self.files(tier);
+        let files = files.iter().filter(|file| file.end > time);
+        files.map(|file| file.begin).min()
+    }
+
     fn lock(&self) -> MutexGuard<'_, [Vec<Blocks>; 2]> {
         self.tiers.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -309,8 +324,9 @@ impl Store {
             let done = self.condensed(&files).or(begin);
             done.unwrap_or(u32::MAX)
         } else {
-            let files = self.files(Tier::Seconds);
-            files.iter().map(|file| file.begin).min().unwrap_or(0)
+            // A file from before the clock was set says nothing about these times.
+            self.begin_after(Tier::Seconds, times.start)
+                .unwrap_or(u32::MAX)
         };
         let older = times.start..times.end.min(border);
         let newer = times.start.max(border)..times.end;

@@ -366,3 +366,39 @@ proptest! {
         let _ = store.state(180);
     }
 }
+
+#[test]
+fn a_file_that_was_deleted_is_replaced_at_the_next_write() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = filled(directory.path(), LIMIT, 1000..1015);
+    for file in files(directory.path()) {
+        fs::remove_file(file).unwrap();
+    }
+    for minute_of in 1015..1045 {
+        store
+            .append(Tier::Seconds, &minute(minute_of * 60))
+            .unwrap();
+        store.condense(minute_of * 60 + 60).unwrap();
+    }
+    assert_eq!(rows(&store, 60_900..62_700, 1).len(), 1800);
+    let again = Store::open(directory.path(), LIMIT).unwrap();
+    assert_eq!(rows(&again, 60_900..62_700, 1).len(), 1800);
+}
+
+/// Earlier, a file from before the network set the clock hid the merged rows of hours ago.
+#[test]
+fn a_file_of_an_unset_clock_does_not_hide_older_rows() {
+    let directory = tempfile::tempdir().unwrap();
+    drop(filled(directory.path(), LIMIT, 1000..1060));
+    // The seconds of that hour were deleted for later ones.
+    for file in files(directory.path()) {
+        let name = file.file_name().unwrap().to_str().unwrap().to_owned();
+        if name.contains("seconds") {
+            fs::remove_file(file).unwrap();
+        }
+    }
+    drop(filled(directory.path(), LIMIT, 0..3));
+    let store = filled(directory.path(), LIMIT, 2000..2010);
+    assert_eq!(store.begin_after(Tier::Seconds, 60_000), Some(120_000));
+    assert!(!rows(&store, 60_000..61_000, 1).is_empty());
+}

@@ -17,8 +17,8 @@ use super::document::Node;
 use super::mistake::{Mistakes, Position};
 use super::shape::{
     ApiShape, CaptureShape, ConfigShape, FoxgloveShape, LogLevelShape, MetricsShape, OtlpShape,
-    RecordingsShape, RemoteWriteShape, RobotShape, Ros2DaemonShape, ShipShape, SnapshotShape,
-    Switch, WatchEntryShape, WatchShape,
+    PageShape, RecordingsShape, RemoteWriteShape, RobotShape, Ros2DaemonShape, ShipShape,
+    SnapshotShape, Switch, WatchEntryShape, WatchShape,
 };
 use super::watch::{
     ExpectationValues, Expectations, PatternError, Retain, Watch, check_globs, check_pattern,
@@ -160,7 +160,7 @@ impl Reader {
             api,
             foxglove: self.foxglove(shape.foxglove.unwrap_or_default(), has_token),
             ros2_daemon: ros2_daemon(shape.ros2_daemon.unwrap_or_default()),
-            history: Duration::from_secs(page.history_s.into()),
+            history: Duration::from_secs(history_seconds(&page).into()),
             history_bytes: page.history_bytes,
             otlp: otlp(shape.otlp.unwrap_or_default()),
             remote_write: self.remote_write(shape.remote_write.unwrap_or_default()),
@@ -754,6 +754,19 @@ fn metrics(shape: MetricsShape) -> MetricsSettings {
         histograms: shape.histograms,
         per_writer: shape.per_writer,
         web_config: shape.web_config.map(PathBuf::from),
+    }
+}
+
+/// Shortest history in memory from which the one on disk is written, in seconds: each minute, and
+/// later on a busy machine.
+const MIN_WRITTEN_HISTORY_S: u32 = 120;
+
+/// Returns the seconds of history in memory.
+fn history_seconds(page: &PageShape) -> u32 {
+    match page.history_s {
+        0 => 0,
+        seconds if page.history_bytes > 0 => seconds.max(MIN_WRITTEN_HISTORY_S),
+        seconds => seconds,
     }
 }
 

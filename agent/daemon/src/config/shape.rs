@@ -503,7 +503,8 @@ pub(super) struct ExtractionShape {
 #[serde(deny_unknown_fields, default)]
 pub(super) struct PageShape {
     /// Seconds of figures kept per measured topic, for charts; 0 = none. They use at most 6 MiB:
-    /// with more than 436 topics, fewer seconds are kept.
+    /// with more than 436 topics, fewer seconds are kept. At least 120 with `history_bytes`, which
+    /// is written once a minute.
     #[schemars(range(min = 0, max = 3_600))]
     pub(super) history_s: u32,
     /// Maximum size of the history of the last days in `state_directory`, in bytes; 0 = none. It

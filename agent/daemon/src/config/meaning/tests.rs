@@ -464,3 +464,12 @@ fn too_many_and_invalid_ports_of_zenoh_are_reported() {
          f:1:30: capture.zenoh.ports[1]: is 65536, must be between 1 and 65535"
     );
 }
+
+#[test]
+fn the_history_on_disk_needs_two_minutes_in_memory() {
+    let seconds = |source: &str| parse(source.as_bytes()).unwrap().history.as_secs();
+    assert_eq!(seconds("page: {history_s: 30}"), 120);
+    assert_eq!(seconds("page: {history_s: 30, history_bytes: 0}"), 30);
+    assert_eq!(seconds("page: {history_s: 0}"), 0);
+    assert_eq!(seconds("page: {history_s: 900}"), 900);
+}

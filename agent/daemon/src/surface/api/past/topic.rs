@@ -50,8 +50,8 @@ pub(in super::super) async fn show(
             Some(wanted) => of == wanted,
             None => of.dds_name == former && domain.admits(DomainId(of.domain_id)),
         };
-        let seconds = store.span(Tier::Seconds);
-        if seconds.is_none_or(|seconds| seconds.begin > times.from) {
+        let seconds = store.begin_after(Tier::Seconds, times.from);
+        if seconds.is_none_or(|begin| begin > times.from) {
             times.step = times.step.max(RATE_WINDOW_SECONDS);
         }
         let (mut steps, mut first) = (Vec::new(), None::<TopicName>);
