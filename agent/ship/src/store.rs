@@ -1,6 +1,7 @@
 //! Destinations: object stores with parts that outlive this process, and folders.
 
 use std::fs;
+use std::os::unix::fs::MetadataExt as _;
 use std::path::PathBuf;
 use std::str::FromStr;
 use std::sync::Arc;
@@ -34,7 +35,47 @@ pub(crate) struct Store {
 
 enum Client {
     Parts(Arc<dyn Parts>),
-    Folder(Arc<LocalFileSystem>),
+    Folder(Arc<LocalFileSystem>, Folder),
+}
+
+/// The folder of a destination.
+struct Folder {
+    path: PathBuf,
+    /// Directory above it, or itself, at which another file system was mounted.
+    mount_point: Option<PathBuf>,
+}
+
+impl Folder {
+    fn open(path: PathBuf) -> Result<Self, SettingsError> {
+        if !path.is_dir() {
+            return Err(SettingsError::Folder(path));
+        }
+        Ok(Self {
+            mount_point: path
+                .ancestors()
+                .find(|it| is_mount_point(it))
+                .map(Into::into),
+            path,
+        })
+    }
+
+    /// Fails if the folder is gone. Files would otherwise create it again: on the robot's own disk,
+    /// if a disk was removed.
+    fn check(&self) -> Result<(), StoreError> {
+        let is_mounted = self.mount_point.as_deref().is_none_or(is_mount_point);
+        if self.path.is_dir() && is_mounted {
+            return Ok(());
+        }
+        let gone = SettingsError::Folder(self.path.clone());
+        Err(StoreError::Unusable(gone.to_string()))
+    }
+}
+
+/// Returns whether a directory is on another file system than the one above it. The root is none.
+fn is_mount_point(path: &std::path::Path) -> bool {
+    let device = |path: &std::path::Path| fs::metadata(path).ok().map(|it| it.dev());
+    path.parent()
+        .is_some_and(|above| device(path) != device(above))
 }
 
 /// A store whose parts can be sent by one process and completed by another.
@@ -106,7 +147,12 @@ impl Store {
     }
 
     fn reopen(&mut self, credentials: Credentials) -> Result<(), SettingsError> {
-        self.client = client(&self.settings, &credentials, &self.link)?;
+        let mut client = client(&self.settings, &credentials, &self.link)?;
+        if let (Client::Folder(_, new), Client::Folder(_, known)) = (&mut client, &self.client) {
+            // A disk that was removed and comes again is mounted, as before.
+            new.mount_point = known.mount_point.clone().or(new.mount_point.take());
+        }
+        self.client = client;
         self.credentials = credentials;
         Ok(())
     }
@@ -137,8 +183,9 @@ impl Store {
 
     /// Writes an object at once. It replaces an earlier one.
     pub(crate) async fn put(&self, path: &Path, content: Bytes) -> Result<(), StoreError> {
-        if matches!(self.client, Client::Folder(_)) {
+        if let Client::Folder(_, folder) = &self.client {
             sleep_until(self.link.reserve(content.len())).await;
+            folder.check()?;
         }
         let put = self.object_store().put(path, content.into()).await;
         put.map(drop).map_err(|error| self.failed(&error))
@@ -192,9 +239,10 @@ impl Store {
 
     /// Begins a file in a folder. Files of earlier attempts are removed.
     pub(crate) async fn begin_file(&self, path: &Path) -> Result<FolderFile, StoreError> {
-        let Client::Folder(folder) = &self.client else {
+        let Client::Folder(folder, place) = &self.client else {
             return Err(unsupported());
         };
+        place.check()?;
         let file = folder.path_to_filesystem(path);
         remove_attempts(&file.map_err(|error| self.failed(&error))?);
         let upload = folder.put_multipart(path).await;
@@ -207,19 +255,19 @@ impl Store {
     fn object_store(&self) -> &dyn ObjectStore {
         match &self.client {
             Client::Parts(store) => store,
-            Client::Folder(folder) => folder,
+            Client::Folder(folder, _) => folder,
         }
     }
 
     fn parts(&self) -> Result<&dyn Parts, StoreError> {
         match &self.client {
             Client::Parts(store) => Ok(&**store),
-            Client::Folder(_) => Err(unsupported()),
+            Client::Folder(..) => Err(unsupported()),
         }
     }
 
     fn failed(&self, error: &Error) -> StoreError {
-        if matches!(self.client, Client::Folder(_)) {
+        if matches!(self.client, Client::Folder(..)) {
             return unusable(error);
         }
         match self.link.refusal() {
@@ -395,16 +443,42 @@ fn parsed<K: FromStr>(
 
 /// Opens a folder, which must exist: the path of a disk that is not mounted is not created.
 fn open_folder(folder: PathBuf) -> Result<Client, SettingsError> {
-    if !folder.is_dir() {
-        return Err(SettingsError::Folder(folder));
-    }
-    let store = LocalFileSystem::new_with_prefix(folder).map_err(SettingsError::Store)?;
-    Ok(Client::Folder(Arc::new(store.with_fsync(true))))
+    let place = Folder::open(folder)?;
+    let store = LocalFileSystem::new_with_prefix(&place.path).map_err(SettingsError::Store)?;
+    Ok(Client::Folder(Arc::new(store.with_fsync(true)), place))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_folder_that_is_gone_or_no_longer_mounted_is_refused() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("bags");
+        assert!(Folder::open(path.clone()).is_err());
+        fs::create_dir(&path).unwrap();
+        let folder = Folder::open(path.clone()).unwrap();
+        assert_eq!(folder.check(), Ok(()));
+        fs::remove_dir(&path).unwrap();
+        let Err(StoreError::Unusable(reason)) = folder.check() else {
+            panic!("it is gone");
+        };
+        assert!(reason.contains(&path.display().to_string()), "{reason}");
+        // A disk that was mounted at the directory above it is gone.
+        fs::create_dir(&path).unwrap();
+        let folder = Folder {
+            mount_point: Some(directory.path().to_owned()),
+            path,
+        };
+        assert!(folder.check().is_err());
+        let proc = Folder::open(PathBuf::from("/proc/self")).unwrap();
+        assert_eq!(
+            proc.mount_point.as_deref(),
+            Some(std::path::Path::new("/proc"))
+        );
+        assert_eq!(proc.check(), Ok(()));
+    }
 
     #[test]
     fn only_the_error_code_of_a_response_is_printed() {
