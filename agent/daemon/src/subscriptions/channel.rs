@@ -69,6 +69,8 @@ struct Queue {
     end: Option<&'static str>,
     /// Whether the stream was closed by the reader, or after its end.
     closed: bool,
+    /// Whether the reader does not know yet that a replay went back.
+    begins_again: bool,
 }
 
 /// Bytes that count towards the sum of all queues until this value is dropped.
@@ -234,11 +236,17 @@ impl Channel {
         self.outlives_end.store(true, Ordering::Relaxed);
     }
 
-    /// Continues the stream if it outlives its end.
+    /// Continues the stream if it outlives its end. Its reader first gets an end, and none of the
+    /// items that wait.
     pub(super) fn begin_again(&self) {
         if self.outlives_end.load(Ordering::Relaxed) {
             let mut queue = self.lock();
             (queue.end, queue.closed) = (None, false);
+            queue.waiting = Backlog::default();
+            queue.begins_again = true;
+            self.bytes.store(0, Ordering::Relaxed);
+            drop(queue);
+            self.wake();
         }
     }
 
@@ -317,6 +325,9 @@ impl Channel {
     }
 
     fn pop(&self, queue: &mut Queue) -> Option<Item> {
+        if std::mem::take(&mut queue.begins_again) {
+            return Some(Item::End("the replay goes back"));
+        }
         if let Some(missed) = queue.dropped.pop() {
             return Some(Item::Missed(missed));
         }
