@@ -163,20 +163,22 @@ impl Learner {
     /// without steps; `None` if the robot's clock has none, as in a replay.
     pub fn observe(&mut self, list: &TopicList<'_>, request: Option<Request>) {
         let now = list.timestamp_seconds;
-        let elapsed = self.elapsed(now, request);
         // A busy agent repeats its last state.
-        let is_known = self.latest() == Some(now);
-        if is_known || (self.period.is_some() && elapsed < MIN_STEP) {
+        if self.latest() == Some(now) {
+            return;
+        }
+        let Some(elapsed) = self.elapsed(now, request) else {
+            // What was counted since the last view took an unknown time.
+            self.latest_request = request;
+            self.period = self.period.map(|(first, _)| (first, now));
+            self.count(list, now, 0.0, 0);
+            return;
+        };
+        if self.period.is_some() && elapsed < MIN_STEP {
             return;
         }
         let steps = whole_seconds(elapsed.min(MAX_STEP)).min(MAX_SECONDS - self.seconds);
-        for topic in &list.topics {
-            if self.selection.covers(topic)
-                && let Some(observation) = self.observation(&topic.name)
-            {
-                observation.observe(topic, now, elapsed, steps);
-            }
-        }
+        self.count(list, now, elapsed, steps);
         self.seconds += steps;
         for observation in self.topics.values_mut() {
             observation.complete(self.seconds);
@@ -186,18 +188,26 @@ impl Learner {
         self.latest_request = request;
     }
 
-    /// Returns the seconds since the last view: by the robot's clock, which a late answer does not
-    /// change. If that is impossible, the clock was set, and the answers' times count.
-    fn elapsed(&self, now: f64, request: Option<Request>) -> f64 {
+    /// Returns the seconds since the last view by the robot's clock, which a late answer does not
+    /// change; `None` if they are impossible, because the clock was set.
+    fn elapsed(&self, now: f64, request: Option<Request>) -> Option<f64> {
         let by_robot = self.latest().map_or(0.0, |last| now - last);
         let Some((before, request)) = self.latest_request.zip(request) else {
-            return by_robot;
+            return Some(by_robot);
         };
         let shortest = request.sent - before.answered - MAX_STATE_AGE;
         let longest = request.answered - before.sent + MAX_STATE_AGE;
-        match (shortest..=longest).contains(&by_robot) {
-            true => by_robot,
-            false => request.answered - before.answered,
+        (shortest..=longest).contains(&by_robot).then_some(by_robot)
+    }
+
+    /// Counts what happened since the last view in `steps` seconds; none: only from this view on.
+    fn count(&mut self, list: &TopicList<'_>, now: f64, elapsed: f64, steps: u32) {
+        for topic in &list.topics {
+            if self.selection.covers(topic)
+                && let Some(observation) = self.observation(&topic.name)
+            {
+                observation.observe(topic, now, elapsed, steps);
+            }
         }
     }
 

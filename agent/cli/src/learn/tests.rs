@@ -337,7 +337,7 @@ fn a_robot_whose_clock_is_set_keeps_its_thresholds() {
             }
             robot.second(STEADY);
         }
-        assert_eq!(robot.learner.seconds(), 60, "{step}");
+        assert_eq!(robot.learner.seconds(), 59, "{step}");
         let values = robot.topic_thresholds().values;
         assert_eq!(
             (values.min_rate_hz, values.max_rate_hz, values.publishers),
