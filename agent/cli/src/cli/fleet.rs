@@ -1,11 +1,12 @@
 //! `rp fleet`.
 
+use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::{Context as _, Result};
 use clap::Args;
-use ros2probe::fleet::{self, Engine, Question};
+use ros2probe::fleet::{self, Engine, Link, Page, Question};
 
 use super::{Output, UserError};
 
@@ -26,7 +27,9 @@ expectation, 2 wrong usage, 1 otherwise.
 
 Examples:
   rp fleet --engine http://prometheus.example:9090
-  rp fleet --engine https://mimir.example/prometheus --token-file token --json")]
+  rp fleet --engine https://mimir.example/prometheus --token-file token --json
+  rp fleet --engine http://prometheus.example:9090 --listen 127.0.0.1:17410 \
+    --link 'http://{robot}.example:17401/'")]
 pub(crate) struct Fleet {
     /// URL of Prometheus, VictoriaMetrics, Mimir or Thanos [default: $ROS2PROBE_ENGINE]
     #[arg(long, value_name = "URL")]
@@ -44,8 +47,14 @@ pub(crate) struct Fleet {
     #[arg(long, value_name = "SECONDS", default_value_t = 60, value_parser = clap::value_parser!(u32).range(1..=86_400))]
     reach: u32,
     /// Print JSON: one object
-    #[arg(long)]
+    #[arg(long, conflicts_with = "listen")]
     json: bool,
+    /// Serve a page with the robots at this loopback address, until Ctrl-C
+    #[arg(long, value_name = "ADDRESS")]
+    listen: Option<SocketAddr>,
+    /// URL of a robot's own page, with {robot} in place of its name: the page links to it
+    #[arg(long, value_name = "URL", requires = "listen")]
+    link: Option<Link>,
 }
 
 /// Exit code if a robot is in trouble.
@@ -73,6 +82,15 @@ impl Fleet {
             hours: self.since,
             reach: self.reach,
         };
+        if let Some(address) = self.listen {
+            let page = Page::bind(address, self.link)?;
+            eprintln!(
+                "rp: the fleet is at http://{}/ (Ctrl-C ends)",
+                page.local_addr()?
+            );
+            page.serve(engine, question)?;
+            return Ok(ExitCode::SUCCESS);
+        }
         let fleet = fleet::Fleet::read(&engine, &question);
         let fleet = fleet.with_context(|| format!("the engine at {url}"))?;
         if fleet.robots.is_empty() {

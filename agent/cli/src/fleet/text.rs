@@ -15,7 +15,7 @@ impl fmt::Display for Fleet {
             "ROBOT", "STATE", "SEEN", "NODES", "TOPICS", "LOSS", "VERSION",
         ];
         let mut rows = vec![head.map(str::to_owned)];
-        rows.extend(self.robots.iter().map(row));
+        rows.extend(self.robots.iter().map(cells));
         let mut widths = [0; 7];
         for row in &rows {
             for (width, cell) in widths.iter_mut().zip(row) {
@@ -36,7 +36,9 @@ impl fmt::Display for Fleet {
     }
 }
 
-fn row(robot: &Robot) -> [String; 7] {
+/// Returns the cells of a robot's row: its name, state, age of the last sample, numbers of nodes and
+/// topics, loss, and version. They have no control characters.
+pub(super) fn cells(robot: &Robot) -> [String; 7] {
     let is_known = robot.state != State::OutOfReach;
     let known = |text: String| if is_known { text } else { "-".to_owned() };
     [
@@ -56,27 +58,36 @@ fn row(robot: &Robot) -> [String; 7] {
     ]
 }
 
-/// Writes what is wrong with a robot, and what differs from the others.
+/// Returns what is wrong with a robot, and what differs from the others, as lines without control
+/// characters.
+pub(super) fn faults(robot: &Robot) -> impl Iterator<Item = String> {
+    let violated = robot.violated.iter().map(|(topic, expectation)| {
+        format!("{}: {} is violated", visible(topic), visible(expectation))
+    });
+    let findings = robot
+        .findings
+        .iter()
+        .map(|(kind, count)| format!("{count} x {}", visible(kind)));
+    let differences = robot.differences.iter();
+    let differences = differences.map(|difference| visible(&difference.to_string()).to_string());
+    violated.chain(findings).chain(differences)
+}
+
+/// Returns the number of lines that [`faults`] has.
+pub(super) fn fault_count(robot: &Robot) -> usize {
+    robot.violated.len() + robot.findings.len() + robot.differences.len()
+}
+
 fn details(f: &mut fmt::Formatter<'_>, robot: &Robot) -> fmt::Result {
-    if robot.violated.is_empty() && robot.findings.is_empty() && robot.differences.is_empty() {
+    let more = robot.differences.len().saturating_sub(MAX_DIFFERENCES);
+    let count = fault_count(robot);
+    if count == 0 {
         return Ok(());
     }
     writeln!(f, "\n{}", visible(&robot.name))?;
-    for (topic, expectation) in &robot.violated {
-        writeln!(
-            f,
-            "  {}: {} is violated",
-            visible(topic),
-            visible(expectation)
-        )?;
-    }
-    for (kind, count) in &robot.findings {
-        writeln!(f, "  {count} x {}", visible(kind))?;
-    }
-    for difference in robot.differences.iter().take(MAX_DIFFERENCES) {
-        writeln!(f, "  {}", visible(&difference.to_string()))?;
-    }
-    match robot.differences.len().saturating_sub(MAX_DIFFERENCES) {
+    let mut lines = faults(robot).take(count - more);
+    lines.try_for_each(|line| writeln!(f, "  {line}"))?;
+    match more {
         0 => Ok(()),
         more => writeln!(f, "  ... and {more} more differences (--json)"),
     }

@@ -6,7 +6,7 @@ use std::path::Path;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context as _, Result, ensure};
-use ros2probe_testing::harness::agent::{Agent, Scrape, at_the_sockets_of};
+use ros2probe_testing::harness::agent::{Agent, Scrape, at_the_sockets_of, get};
 use ros2probe_testing::harness::loss::Loss;
 use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::process::Process;
@@ -105,11 +105,42 @@ fn rp_fleet_finds_the_differing_robots_among_ten() -> Result<()> {
             .is_some_and(|all| !all.is_empty());
         ensure!(odd == (robot["name"] == "robot-7"), "{robot}");
     }
+    the_page_has_the_robots(&centre)?;
     let (code, text) = fleet(&["--job", "other"])?;
     ensure!(
         code == Some(1) && text.contains("has no robots of the job `other`"),
         "{text}"
     );
+    Ok(())
+}
+
+/// Checks that the page of `rp fleet` has the same robots as its text.
+fn the_page_has_the_robots(centre: &Namespace) -> Result<()> {
+    let arguments = [
+        "fleet",
+        "--engine",
+        "http://127.0.0.1:9090",
+        "--reach",
+        "10",
+    ];
+    let listen = ["--listen", "127.0.0.1:17410"];
+    let link = ["--link", "http://{robot}.example:17401/"];
+    let arguments = arguments.into_iter().chain(listen).chain(link);
+    let program = env!("CARGO_BIN_EXE_rp");
+    let mut server = Process::start(&centre.outside(), program, arguments)?;
+    let mut page = String::new();
+    wait_within(Duration::from_secs(40), "ten robots on the page", || {
+        page = get(centre, "http://127.0.0.1:17410/").unwrap_or_default();
+        Ok(page.contains("<h1>10 robots</h1>"))
+    })?;
+    for part in [
+        "<span class=\"bad\">1 out of reach</span>",
+        "<a href=\"http://robot-7.example:17401/\">robot-7</a>",
+        " is missing (8 of 9)</li>",
+    ] {
+        ensure!(page.contains(part), "{part}: {page}");
+    }
+    server.terminate()?;
     Ok(())
 }
 

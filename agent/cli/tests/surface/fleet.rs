@@ -1,10 +1,13 @@
 //! `rp fleet` with engines that answer as they should not.
 
-use std::io::Read as _;
-use std::net::{SocketAddr, TcpListener};
-use std::time::Duration;
+use std::io::{BufRead as _, BufReader, Read as _, Write as _};
+use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::process::{Child, Stdio};
+use std::time::{Duration, Instant};
 
 use crate::rp;
+
+const PATIENCE: Duration = Duration::from_secs(60);
 
 /// Starts an engine that answers each request with these bytes, and then ends the connection.
 fn engine(
@@ -125,4 +128,145 @@ fn an_address_and_a_token_are_checked_before_a_request() {
     let (code, text) = fleet(&["--engine", "http://127.0.0.1:9", "--token-file", token]);
     assert_eq!(code, Some(1));
     assert!(text.contains(&format!("cannot read {token}")), "{text}");
+}
+
+/// `rp fleet --listen`, with the address of its page.
+struct Page {
+    child: Child,
+    address: SocketAddr,
+}
+
+impl Page {
+    fn start(engine: &str) -> Self {
+        let mut child = rp()
+            .args(["fleet", "--engine", engine, "--listen", "127.0.0.1:0"])
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let mut line = String::new();
+        let mut errors = BufReader::new(child.stderr.take().unwrap());
+        errors.read_line(&mut line).unwrap();
+        let address = line.split("http://").nth(1).unwrap();
+        let address = address.split('/').next().unwrap().parse().unwrap();
+        Self { child, address }
+    }
+
+    /// Returns the answer to a request with this line and these headers.
+    fn request(&self, text: &str) -> String {
+        let mut stream = TcpStream::connect(self.address).unwrap();
+        write!(stream, "{text}\r\n\r\n").unwrap();
+        let mut answer = String::new();
+        stream.read_to_string(&mut answer).unwrap();
+        answer
+    }
+
+    fn get(&self, path: &str) -> String {
+        self.request(&format!("GET {path} HTTP/1.1\r\nHost: localhost"))
+    }
+
+    fn waits_for(&self, path: &str, part: &str) {
+        let begun = Instant::now();
+        loop {
+            let answer = self.get(path);
+            if answer.contains(part) {
+                return;
+            }
+            assert!(begun.elapsed() < PATIENCE, "{part}: {answer}");
+            std::thread::sleep(Duration::from_millis(50));
+        }
+    }
+}
+
+impl Drop for Page {
+    fn drop(&mut self) {
+        self.child.kill().unwrap();
+        self.child.wait().unwrap();
+    }
+}
+
+/// An engine that answers each query with an empty vector.
+fn empty() -> SocketAddr {
+    engine(|out| {
+        let text = r#"{"status":"success","data":{"resultType":"vector","result":[]}}"#;
+        let length = text.len();
+        write!(
+            out,
+            "HTTP/1.1 200 OK\r\nContent-Length: {length}\r\n\r\n{text}"
+        )
+    })
+}
+
+#[test]
+fn the_page_shows_what_the_engine_answers_and_why_it_does_not() {
+    let page = Page::start(&format!("http://{}", empty()));
+    page.waits_for("/", "No robot delivers to the engine.");
+    let answer = page.get("/?paused");
+    for part in [
+        "HTTP/1.1 200 OK",
+        "cache-control: no-store",
+        "x-content-type-options: nosniff",
+        "default-src 'none'",
+        "The page is paused.",
+    ] {
+        assert!(answer.contains(part), "{part}: {answer}");
+    }
+    page.waits_for("/fleet.json", "\"robots\": []");
+    // Nobody listens there any more.
+    let nowhere = TcpListener::bind("127.0.0.1:0")
+        .unwrap()
+        .local_addr()
+        .unwrap();
+    let page = Page::start(&format!("http://{nowhere}"));
+    page.waits_for("/", "the connection failed");
+    let answer = page.get("/fleet.json");
+    assert!(answer.starts_with("HTTP/1.1 503 "), "{answer}");
+}
+
+#[test]
+fn the_page_answers_only_requests_for_this_host() {
+    let page = Page::start(&format!("http://{}", empty()));
+    for (request, status) in [
+        ("GET / HTTP/1.1\r\nHost: evil.example", "403"),
+        ("GET / HTTP/1.1", "403"),
+        (
+            "POST / HTTP/1.1\r\nHost: localhost\r\nContent-Length: 0",
+            "405",
+        ),
+        ("GET /metrics HTTP/1.1\r\nHost: 127.0.0.1:80", "404"),
+        ("nonsense", "400"),
+    ] {
+        let answer = page.request(request);
+        let expected = format!("HTTP/1.1 {status} ");
+        assert!(answer.starts_with(&expected), "{request}: {answer}");
+    }
+    let listen = |address: &str| fleet(&["--engine", "http://127.0.0.1:9", "--listen", address]);
+    let (code, text) = listen("0.0.0.0:0");
+    assert_eq!(code, Some(1));
+    assert!(
+        text.contains("0.0.0.0:0 is not a loopback address"),
+        "{text}"
+    );
+    let (code, text) = listen(&page.address.to_string());
+    assert_eq!(code, Some(1));
+    assert!(text.contains("cannot listen on 127.0.0.1:"), "{text}");
+    for wrong in ["http://robot/", "{robot}"] {
+        let listen = ["--engine", "http://127.0.0.1:9", "--listen", "127.0.0.1:0"];
+        let (code, text) = fleet(&[&listen[..], &["--link", wrong]].concat());
+        assert_eq!(code, Some(2));
+        assert!(text.contains("is no URL with {robot}"), "{text}");
+    }
+}
+
+#[test]
+fn connections_beyond_the_cap_wait_until_silent_ones_are_closed() {
+    let page = Page::start(&format!("http://{}", empty()));
+    let silent: Vec<_> = (0..64)
+        .map(|_| TcpStream::connect(page.address).unwrap())
+        .collect();
+    // The silent ones are accepted first.
+    let begun = Instant::now();
+    let answer = page.get("/");
+    assert!(answer.starts_with("HTTP/1.1 200 OK"), "{answer}");
+    assert!(begun.elapsed() > Duration::from_secs(1), "it did not wait");
+    drop(silent);
 }

@@ -12,7 +12,7 @@ use axum::http::header::HOST;
 ///
 /// # Errors
 /// Returns the header's value; empty if it is missing or repeated.
-pub(super) fn own(headers: &HeaderMap) -> Result<(), &str> {
+pub fn own(headers: &HeaderMap) -> Result<(), &str> {
     let mut hosts = headers.get_all(HOST).iter();
     let (Some(host), None) = (hosts.next(), hosts.next()) else {
         return Err("");

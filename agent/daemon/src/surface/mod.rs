@@ -3,7 +3,7 @@
 
 mod agent_metrics;
 pub mod api;
-mod authority;
+pub mod authority;
 mod basic_auth;
 mod chain_metrics;
 mod collect;

@@ -1,0 +1,306 @@
+//! A fleet as one HTML page without scripts and foreign requests. All names are escaped.
+
+use std::fmt::Write as _;
+use std::time::Duration;
+
+use jiff::Timestamp;
+use percent_encoding::{NON_ALPHANUMERIC, utf8_percent_encode};
+use quick_xml::escape::escape;
+
+use super::robot::{Fleet, Robot, State};
+use super::text::{cells, fault_count, faults};
+
+/// The place of a robot's name in a [`Link`].
+const ROBOT: &str = "{robot}";
+/// Maximum number of lines about one robot.
+const MAX_FAULTS: usize = 200;
+const STYLE: &str = include_str!("../ci/report.css");
+const HEAD: &str = "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\
+<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'\">\
+<meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\
+<meta name=\"color-scheme\" content=\"light dark\">";
+
+/// What the page shows.
+#[derive(Debug)]
+pub(super) struct Content<'a> {
+    /// The fleet and when it was read; `None` before the first answer of the engine.
+    pub fleet: Option<(&'a Fleet, Timestamp)>,
+    /// Why the last request to the engine failed.
+    pub problem: Option<&'a str>,
+    /// Pause after which the browser reads the page again; `None` = never.
+    pub refresh: Option<Duration>,
+    /// The page of a robot.
+    pub link: Option<&'a Link>,
+}
+
+/// The address of a robot's own page.
+#[derive(Clone, Debug)]
+pub struct Link(String);
+
+/// A text is not the address of robots' pages.
+#[derive(Debug, thiserror::Error)]
+#[error("`{0}` is no URL with {ROBOT}, as in `http://{ROBOT}.example:17401/`")]
+pub struct InvalidLink(String);
+
+impl std::str::FromStr for Link {
+    type Err = InvalidLink;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        let is_web = ["http://", "https://"]
+            .iter()
+            .any(|it| text.starts_with(it));
+        match is_web && text.contains(ROBOT) {
+            true => Ok(Self(text.to_owned())),
+            false => Err(InvalidLink(text.to_owned())),
+        }
+    }
+}
+
+impl Link {
+    fn of(&self, robot: &str) -> String {
+        // Host names have hyphens and dots.
+        const ENCODED: &percent_encoding::AsciiSet = &NON_ALPHANUMERIC.remove(b'-').remove(b'.');
+        let name = utf8_percent_encode(robot, ENCODED).to_string();
+        self.0.replace(ROBOT, &name)
+    }
+}
+
+/// Returns the page.
+pub(super) fn html(content: &Content<'_>) -> String {
+    let robots = content.fleet.map_or(&[][..], |(fleet, _)| &fleet.robots);
+    let title = match content.fleet {
+        Some(_) => format!("{} robots", robots.len()),
+        None => "Fleet".to_owned(),
+    };
+    let refresh = content.refresh.map_or_else(String::new, |pause| {
+        format!(
+            "<meta http-equiv=\"refresh\" content=\"{}\">",
+            pause.as_secs()
+        )
+    });
+    let mut page = format!(
+        "{HEAD}{refresh}<title>{title}</title><style>{STYLE}</style></head><body>\n<h1>{title}</h1>\n"
+    );
+    if let Some(problem) = content.problem {
+        let problem = escape(problem);
+        let _ = writeln!(page, "<p class=\"bad\" role=\"alert\">{problem}</p>");
+    }
+    time(&mut page, content);
+    if !robots.is_empty() {
+        table(&mut page, robots, content.link);
+        details(&mut page, robots);
+    }
+    page.push_str("</body></html>\n");
+    page
+}
+
+fn time(page: &mut String, content: &Content<'_>) {
+    let refresh = match content.refresh {
+        Some(pause) => format!(
+            "The page is read again every {} s. <a href=\"?paused\">Pause</a>",
+            pause.as_secs()
+        ),
+        None => "The page is paused. <a href=\"./\">Continue</a>".to_owned(),
+    };
+    let _ = match content.fleet {
+        Some((fleet, at)) => {
+            let at = at.strftime("%Y-%m-%d %H:%M:%S UTC");
+            let counts = counts(&fleet.robots);
+            writeln!(
+                page,
+                "<p>{counts}</p>\n<p><small>State of {at}. {refresh}</small></p>"
+            )
+        }
+        None => writeln!(
+            page,
+            "<p>The engine has not answered yet.</p>\n<p><small>{refresh}</small></p>"
+        ),
+    };
+}
+
+/// Returns how many robots are in each state, the worst one first.
+fn counts(robots: &[Robot]) -> String {
+    let states = [
+        State::OutOfReach,
+        State::NotReady,
+        State::Violated,
+        State::Findings,
+        State::Ok,
+    ];
+    let counts = states.iter().filter_map(|state| {
+        let count = robots.iter().filter(|robot| robot.state == *state).count();
+        (count > 0).then(|| {
+            format!(
+                "<span class=\"{}\">{count} {}</span>",
+                class(*state),
+                state.label()
+            )
+        })
+    });
+    match counts.collect::<Vec<_>>().join(", ") {
+        counts if counts.is_empty() => "No robot delivers to the engine.".to_owned(),
+        counts => counts,
+    }
+}
+
+const fn class(state: State) -> &'static str {
+    match state {
+        State::OutOfReach | State::NotReady | State::Violated => "bad",
+        State::Findings => "warn",
+        State::Ok => "good",
+    }
+}
+
+fn table(page: &mut String, robots: &[Robot], link: Option<&Link>) {
+    page.push_str(
+        "<div class=\"wide\"><table><thead><tr><th scope=\"col\">Robot</th><th scope=\"col\">State</th>\
+         <th scope=\"col\">Last sample</th><th scope=\"col\" class=\"n\">Nodes</th>\
+         <th scope=\"col\" class=\"n\">Topics</th><th scope=\"col\" class=\"n\">Loss</th>\
+         <th scope=\"col\">Version</th><th scope=\"col\">Details</th></tr></thead><tbody>\n",
+    );
+    for (place, robot) in robots.iter().enumerate() {
+        let [name, state, seen, nodes, topics, loss, version] = cells(robot);
+        let (name, version) = (escape(&*name), escape(&*version));
+        let name = match link.map(|link| link.of(&robot.name)) {
+            Some(address) => format!("<a href=\"{}\">{name}</a>", escape(&*address)),
+            None => name.into_owned(),
+        };
+        let details = match fault_count(robot) {
+            0 => String::new(),
+            1 => format!("<a href=\"#robot-{place}\">1 line</a>"),
+            lines => format!("<a href=\"#robot-{place}\">{lines} lines</a>"),
+        };
+        let class = class(robot.state);
+        let _ = writeln!(
+            page,
+            "<tr><th scope=\"row\">{name}</th><td class=\"{class}\">{state}</td><td>{seen}</td>\
+             <td class=\"n\">{nodes}</td><td class=\"n\">{topics}</td><td class=\"n\">{loss}</td>\
+             <td>{version}</td><td>{details}</td></tr>"
+        );
+    }
+    page.push_str("</tbody></table></div>\n");
+}
+
+fn details(page: &mut String, robots: &[Robot]) {
+    for (place, robot) in robots.iter().enumerate() {
+        let count = fault_count(robot);
+        if count == 0 {
+            continue;
+        }
+        let [name, ..] = cells(robot);
+        let _ = writeln!(
+            page,
+            "<h2 id=\"robot-{place}\">{}</h2>\n<ul>",
+            escape(&*name)
+        );
+        for line in faults(robot).take(MAX_FAULTS) {
+            let _ = writeln!(page, "<li>{}</li>", escape(&*line));
+        }
+        if let more @ 1.. = count.saturating_sub(MAX_FAULTS) {
+            let _ = writeln!(
+                page,
+                "<li>and {more} more: see <a href=\"fleet.json\">fleet.json</a></li>"
+            );
+        }
+        page.push_str("</ul>\n");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_of_robots_are_escaped_and_link_to_their_pages() {
+        let robot = |name: &str, state| Robot {
+            name: name.to_owned(),
+            state,
+            age_s: 2.0,
+            version: Some("<i>".to_owned()),
+            nodes: 5,
+            topics: 7,
+            loss: Some(0.0125),
+            violated: Vec::new(),
+            findings: [].into(),
+            differences: Vec::new(),
+        };
+        let mut hostile = robot("a\"><script>alert(1)</script>", State::Violated);
+        hostile.violated = vec![("/<b>".to_owned(), "min_rate_hz".to_owned())];
+        let fleet = Fleet {
+            robots: vec![hostile, robot("robot-2.site", State::Ok)],
+        };
+        let link = "https://{robot}.example/?to={robot}".parse().unwrap();
+        let page = html(&Content {
+            fleet: Some((&fleet, Timestamp::UNIX_EPOCH)),
+            problem: Some("<u>"),
+            refresh: Some(Duration::from_secs(10)),
+            link: Some(&link),
+        });
+        for hostile in ["<script", "<b>", "<i>", "<u>"] {
+            assert!(!page.contains(hostile), "{hostile}: {page}");
+        }
+        for part in [
+            "<h1>2 robots</h1>",
+            "<a href=\"https://robot-2.site.example/?to=robot-2.site\">robot-2.site</a>",
+            "<span class=\"bad\">1 violated</span>, <span class=\"good\">1 ok</span>",
+            "<li>/&lt;b&gt;: min_rate_hz is violated</li>",
+            "<td class=\"n\">1.25 %</td>",
+            "State of 1970-01-01 00:00:00 UTC",
+            "http-equiv=\"refresh\" content=\"10\"",
+        ] {
+            assert!(page.contains(part), "{part}: {page}");
+        }
+        for text in ["ftp://{robot}/", "http://robot/", "javascript:{robot}"] {
+            assert!(text.parse::<Link>().is_err(), "{text}");
+        }
+    }
+
+    #[test]
+    fn a_robot_with_many_differences_has_a_last_line_with_their_number() {
+        let difference = |number: usize| super::super::Difference {
+            what: format!("node /n{number}"),
+            here: None,
+            usual: Some("present".to_owned()),
+            robots: 2,
+            of: 3,
+        };
+        let robot = Robot {
+            name: "robot".to_owned(),
+            state: State::Ok,
+            age_s: 2.0,
+            version: None,
+            nodes: 0,
+            topics: 0,
+            loss: None,
+            violated: Vec::new(),
+            findings: [].into(),
+            differences: (0..MAX_FAULTS + 7).map(difference).collect(),
+        };
+        let fleet = Fleet {
+            robots: vec![robot],
+        };
+        let page = html(&Content {
+            fleet: Some((&fleet, Timestamp::UNIX_EPOCH)),
+            problem: None,
+            refresh: None,
+            link: None,
+        });
+        assert_eq!(page.matches("<li>").count(), MAX_FAULTS + 1);
+        assert!(page.contains("and 7 more: see"), "{page}");
+    }
+
+    #[test]
+    fn a_page_before_the_first_answer_and_a_paused_one_say_so() {
+        let page = html(&Content {
+            fleet: None,
+            problem: None,
+            refresh: None,
+            link: None,
+        });
+        assert!(page.contains("The engine has not answered yet."), "{page}");
+        assert!(
+            page.contains("paused") && !page.contains("\"refresh\""),
+            "{page}"
+        );
+    }
+}
