@@ -1,8 +1,9 @@
 //! What the time of callbacks consists of, compared with the kernel's own figures of the process.
 
+use std::fs;
 use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use ros2probe_model::facts::calls::report::ThreadStates;
 
@@ -37,7 +38,23 @@ impl Hog {
         let (program, arguments) = command.split_first().unwrap();
         let mut command = Command::new(program);
         let child = command.args(arguments).stdin(Stdio::null()).spawn();
-        Self(child.expect("install taskset and chrt: apt-get install util-linux"))
+        let hog = Self(child.expect("install taskset and chrt: apt-get install util-linux"));
+        hog.wait_until_it_computes();
+        hog
+    }
+
+    /// Waits for a tenth of a second of CPU time: on a busy machine, the shell starts late.
+    fn wait_until_it_computes(&self) {
+        let begun = Instant::now();
+        let ticks = || -> Option<u64> {
+            let stat = fs::read_to_string(format!("/proc/{}/stat", self.0.id())).ok()?;
+            let (_, fields) = stat.rsplit_once(") ")?;
+            fields.split(' ').nth(11)?.parse().ok()
+        };
+        while ticks().is_none_or(|ticks| ticks < 10) {
+            assert!(begun.elapsed() < Duration::from_secs(60), "no CPU");
+            std::thread::sleep(Duration::from_millis(5));
+        }
     }
 }
 
