@@ -53,7 +53,7 @@ pub struct SnapshotCell {
 #[derive(Clone, Debug)]
 struct LateQuestion {
     at: Instant,
-    /// What tells questions apart: the topic, node or chain; `None` = all.
+    /// The topic, node or chain of the question; `None` = all.
     key: Option<Arc<str>>,
     bound: Option<RequestedBound>,
 }
@@ -530,7 +530,7 @@ mod tests {
         cell.request_late_calls(Some("/scan"), above(7));
         for _ in 0..100 {
             cell.request_late_calls(None, None);
-            // The page asks without a bound.
+            // The page sends requests without a bound.
             cell.request_late_calls(Some("/scan"), None);
         }
         let demand = after(9);

@@ -154,7 +154,7 @@ impl Store {
             _ => Blocks::create(self.free_path(tier, begin), begin)?,
         };
         match file.append(blocks) {
-            // Somebody has deleted the file to gain space.
+            // An operator has deleted the file to gain space.
             Err(error) if error.kind() == io::ErrorKind::NotFound => {
                 file = Blocks::create(self.free_path(tier, begin), begin)?;
                 file.append(blocks)?;

@@ -354,7 +354,7 @@ impl Tables {
         let subscriptions: Vec<_> = subscriptions.collect();
         for handle in subscriptions {
             let key: HandleWords = zerocopy::transmute!(handle);
-            // The programs may count meanwhile, so the time between read and write must be short.
+            // The programs may count between the read and the write, which must follow at once.
             let Ok(words) = self.handles.get(&key, 0) else {
                 continue;
             };

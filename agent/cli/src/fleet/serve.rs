@@ -1,4 +1,4 @@
-//! Serves the page of a fleet on loopback. It queries the engine only while somebody looks.
+//! Serves the page of a fleet on loopback. The engine is queried only while a browser has it open.
 
 use std::convert::Infallible;
 use std::io;
@@ -52,7 +52,7 @@ pub struct Page {
 /// Why the page cannot be served.
 #[derive(Debug, thiserror::Error)]
 pub enum PageError {
-    /// Anybody who reaches the address could read the page.
+    /// Every host that reaches the address could read the page.
     #[error("{0} is not a loopback address: use 127.0.0.1, and a tunnel or a proxy with passwords")]
     Exposed(SocketAddr),
     /// The address is in use.
@@ -68,7 +68,7 @@ pub enum PageError {
     Serve(#[from] io::Error),
 }
 
-/// What was read of the engine, and when somebody asked for it last.
+/// Last answers of the engine, and the time of the last request for the page.
 #[derive(Clone, Debug, Default)]
 struct Known {
     fleet: Option<(Arc<Fleet>, Timestamp)>,
@@ -141,7 +141,7 @@ impl Shared {
         self.known.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Reads the engine while somebody looks at the page.
+    /// Queries the engine while a browser has the page open.
     fn poll(&self, engine: &Engine, question: &Question) {
         loop {
             let is_unasked = |known: &mut Known| {

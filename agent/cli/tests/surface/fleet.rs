@@ -211,7 +211,7 @@ fn the_page_shows_what_the_engine_answers_and_why_it_does_not() {
         assert!(answer.contains(part), "{part}: {answer}");
     }
     page.waits_for("/fleet.json", "\"robots\": []");
-    // Nobody listens there any more.
+    // An engine that does not run.
     let nowhere = TcpListener::bind("127.0.0.1:0")
         .unwrap()
         .local_addr()

@@ -70,7 +70,7 @@ struct Of {
 }
 
 impl Of {
-    /// Returns what tells this request from those about other callbacks.
+    /// Returns a text that differs for requests about other callbacks.
     fn key(&self) -> Option<String> {
         let domain = self.domain_id.map(|id| id.to_string());
         let parts = [&domain, &self.name, &self.from, &self.to];

@@ -139,7 +139,7 @@ pub struct Participant {
     pub(crate) local: bool,
     /// Whether one of its messages came by TCP.
     pub(super) came_by_tcp: bool,
-    /// Who has announced it, if it was only others.
+    /// Participants that have announced it, if it did not announce itself.
     pub(super) relayers: Option<Relayers>,
     /// Whether it has sent user data.
     pub(super) sends: bool,
