@@ -104,9 +104,6 @@ struct State {
     is_closed: bool,
 }
 
-/// Reason in the log for a request without an answer.
-const LATE: &str = "no answer in time";
-
 /// Requests to the receiver, and what is known about it.
 struct Sender<'a> {
     job: &'a Job,
@@ -325,13 +322,6 @@ impl<'a> Sender<'a> {
                     WriteResult::RetryLater(reason.to_owned(), None)
                 }
                 WriteResult::Unconfirmed => WriteResult::UnknownVersion,
-                WriteResult::Late if part.len() > 1 => {
-                    self.job.figures.count_request(Request::Retried, length);
-                    self.failed(LATE);
-                    sleep(pause).await;
-                    return Err(Unwritten::Late);
-                }
-                WriteResult::Late => WriteResult::RetryLater(LATE.to_owned(), None),
                 // Only a second refusal shows that another receiver took its place.
                 WriteResult::UnknownVersion
                     if self.is_known && !std::mem::replace(&mut is_doubted, true) =>
@@ -369,7 +359,15 @@ impl<'a> Sender<'a> {
                     self.limit(length).await;
                     return Err(Unwritten::Refused(reason, written));
                 }
-                WriteResult::Late => {}
+                WriteResult::Late => {
+                    figures.count_request(Request::Retried, length);
+                    self.failed("no answer in time");
+                    sleep(pause).await;
+                    if part.len() > 1 {
+                        return Err(Unwritten::Late);
+                    }
+                    pause = (pause * 2).min(LONGEST_PAUSE);
+                }
                 WriteResult::RetryLater(reason, demanded) => {
                     figures.count_request(Request::Retried, length);
                     self.failed(&reason);
@@ -458,7 +456,7 @@ mod tests {
     use super::*;
     use crate::otlp::{Host, ReadText};
 
-    /// Earlier, the same request was repeated for ever, and nothing arrived any more.
+    /// Earlier, one request was repeated without end, and the receiver got no further samples.
     #[test]
     fn a_backlog_passes_a_link_that_carries_only_small_requests_in_time() {
         const CARRIED_BYTES: usize = 2500;
