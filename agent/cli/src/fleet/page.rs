@@ -213,16 +213,8 @@ mod tests {
     #[test]
     fn names_of_robots_are_escaped_and_link_to_their_pages() {
         let robot = |name: &str, state| Robot {
-            name: name.to_owned(),
-            state,
-            age_s: 2.0,
             version: Some("<i>".to_owned()),
-            nodes: 5,
-            topics: 7,
-            loss: Some(0.0125),
-            violated: Vec::new(),
-            findings: [].into(),
-            differences: Vec::new(),
+            ..Robot::sample(name, state, 2.0)
         };
         let mut hostile = robot("a\"><script>alert(1)</script>", State::Violated);
         hostile.violated = vec![("/<b>".to_owned(), "min_rate_hz".to_owned())];
@@ -265,16 +257,8 @@ mod tests {
             of: 3,
         };
         let robot = Robot {
-            name: "robot".to_owned(),
-            state: State::Ok,
-            age_s: 2.0,
-            version: None,
-            nodes: 0,
-            topics: 0,
-            loss: None,
-            violated: Vec::new(),
-            findings: [].into(),
             differences: (0..MAX_FAULTS + 7).map(difference).collect(),
+            ..Robot::sample("robot", State::Ok, 2.0)
         };
         let fleet = Fleet {
             robots: vec![robot],

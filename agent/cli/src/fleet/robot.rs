@@ -324,6 +324,25 @@ fn quoted(text: &str) -> String {
 }
 
 #[cfg(test)]
+impl Robot {
+    /// Returns a robot for tests, without findings and differences.
+    pub(super) fn sample(name: &str, state: State, age_s: f64) -> Self {
+        Self {
+            name: name.to_owned(),
+            state,
+            age_s,
+            version: Some("0.1.0".to_owned()),
+            nodes: 5,
+            topics: 7,
+            loss: Some(0.0125),
+            violated: Vec::new(),
+            findings: BTreeMap::new(),
+            differences: Vec::new(),
+        }
+    }
+}
+
+#[cfg(test)]
 mod tests {
     use super::*;
 

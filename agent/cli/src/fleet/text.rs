@@ -114,18 +114,7 @@ mod tests {
 
     #[test]
     fn a_fleet_is_printed_as_a_table_with_details_of_faulty_robots() {
-        let robot = |name: &str, state, age_s| Robot {
-            name: name.to_owned(),
-            state,
-            age_s,
-            version: Some("0.1.0".to_owned()),
-            nodes: 5,
-            topics: 7,
-            loss: Some(0.0125),
-            violated: Vec::new(),
-            findings: [].into(),
-            differences: Vec::new(),
-        };
+        let robot = Robot::sample;
         let mut late = robot("robot-2", State::Violated, 4.2);
         late.violated = vec![("/scan".to_owned(), "min_rate_hz".to_owned())];
         late.findings = [("qos_incompatible".to_owned(), 2)].into();
