@@ -499,10 +499,10 @@ mod tests {
         assert!(!attachments.detach_changed(start));
         assert!(is_attached(&attachments) && !attachments.is_installed());
         assert!(attachments.is_search_due(start + SETTLING_TIME));
-        let (nobody, broker) = (processes(0), &mut Broker::here());
-        attachments.follow(&nobody, start, broker);
+        let (no_processes, broker) = (processes(0), &mut Broker::here());
+        attachments.follow(&no_processes, start, broker);
         assert!(is_attached(&attachments));
-        attachments.follow(&nobody, start + DETACH_DELAY, broker);
+        attachments.follow(&no_processes, start + DETACH_DELAY, broker);
         assert!(attachments.probe(&id(1)).is_none());
     }
 

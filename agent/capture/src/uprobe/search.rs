@@ -612,7 +612,7 @@ mod tests {
             on_demand: true,
             stop: AtomicBool::new(false),
         };
-        let reason = || Some("nobody listens".to_owned());
+        let reason = || Some("no broker listens".to_owned());
         followed.failed = reason();
         followed.ask_again(&shared);
         assert_eq!(followed.failed, reason(), "the pause is not over");
