@@ -156,12 +156,50 @@ pub struct Figures {
     pub hops: u32,
     /// Unused.
     pub unused: u32,
+    /// Base delay of the subscription's takes by [`base_delay`].
+    pub base_delay: i64,
     /// Completed calls of the callback whose thread's states are known.
     pub states_known: u64,
     /// What these calls consisted of, by [`thread_state`], in nanoseconds.
     pub states: [u64; thread_state::COUNT],
     /// Counts by [`distribution`] and [`bucket`].
     pub buckets: [[u32; BUCKETS]; 2],
+}
+
+/// The delay that takes of a subscription have without a wait: the shortest one from the source
+/// timestamp to the take, from which waits are measured.
+///
+/// It may be negative, because the timestamp is of the publisher's clock. The clocks of two hosts
+/// drift apart, so it grows by 122 µs per second until a take is earlier: crystals of hosts differ
+/// by less. One number holds it, which is lower by that growth since the machine started. 0 means
+/// that nothing was taken.
+pub mod base_delay {
+    /// The drift is the 2¹³th part of the time.
+    const DRIFT_BITS: u32 = 13;
+
+    /// Returns the number after a take at the time `now`, `delay` nanoseconds after its source
+    /// timestamp.
+    #[inline(always)]
+    #[must_use]
+    pub const fn after_take(base: i64, delay: i64, now: u64) -> i64 {
+        let own = match delay.wrapping_sub(drift(now)) {
+            0 => 1,
+            own => own,
+        };
+        if base == 0 || own < base { own } else { base }
+    }
+
+    /// Returns the nanoseconds by which a delay at the time `now` exceeds the base delay.
+    #[inline(always)]
+    #[must_use]
+    pub const fn wait(base: i64, delay: i64, now: u64) -> u64 {
+        let wait = delay.wrapping_sub(drift(now)).wrapping_sub(base);
+        if base == 0 || wait < 0 { 0 } else { wait as u64 }
+    }
+
+    const fn drift(now: u64) -> i64 {
+        (now >> DRIFT_BITS) as i64
+    }
 }
 
 /// What the thread of a callback did, by the accounting of the scheduler.
@@ -415,6 +453,50 @@ mod tests {
         for index in 0..BUCKETS {
             assert_eq!(bucket(bucket_start(index)), index);
         }
+    }
+
+    const MS: i64 = 1_000_000;
+
+    /// Base delay and last wait after takes each second with these delays in milliseconds.
+    fn after_takes(delays: impl IntoIterator<Item = i64>) -> (i64, u64) {
+        let (mut base, mut wait, mut now) = (0, 0, 1 << 50);
+        for delay in delays {
+            base = base_delay::after_take(base, delay * MS, now);
+            wait = base_delay::wait(base, delay * MS, now);
+            now += 1_000_000_000;
+        }
+        (base, wait)
+    }
+
+    #[test]
+    fn a_wait_is_measured_from_the_shortest_delay() {
+        let (_, wait) = after_takes([5, 3, 9]);
+        assert!((5_870_000..6_000_000).contains(&wait), "{wait}");
+        let (_, wait) = after_takes([5, 3, 2]);
+        assert_eq!(wait, 0);
+        assert_eq!(base_delay::wait(0, 7 * MS, 1), 0);
+    }
+
+    #[test]
+    fn a_publisher_whose_clock_is_ahead_has_waits() {
+        let (_, wait) = after_takes([-30, -31, -11]);
+        assert!((19_870_000..20_000_000).contains(&wait), "{wait}");
+    }
+
+    #[test]
+    fn a_drift_of_a_hundred_microseconds_a_second_is_no_wait() {
+        for direction in [1, -1] {
+            let hour = (0..3_600).map(|second| direction * second / 10);
+            let (_, wait) = after_takes(hour);
+            assert!(wait < 1_000_000, "{wait}");
+        }
+    }
+
+    #[test]
+    fn a_lasting_wait_of_half_a_second_is_known_for_half_an_hour() {
+        let backlog = (0..1_800).map(|second| if second < 10 { 1 } else { 501 });
+        let (_, wait) = after_takes(backlog);
+        assert!(wait > 250_000_000, "{wait}");
     }
 
     #[test]

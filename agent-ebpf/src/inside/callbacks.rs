@@ -3,7 +3,8 @@
 use core::ptr::{read_volatile, write_volatile};
 
 use ros2probe_wire::inside::{
-    Counter, Figures, HOPS_PER_SECOND, Handle, Hop, announced, distribution, kind, thread_state,
+    Counter, Figures, HOPS_PER_SECOND, Handle, Hop, announced, base_delay, distribution, kind,
+    thread_state,
 };
 
 use crate::{
@@ -122,7 +123,7 @@ pub fn on_callback_start(callback: u64, within: bool) {
     }
 }
 
-/// Adds the time since the message's source timestamp, less the minimum delay of the subscription's
+/// Adds the time since the message's source timestamp, less the base delay of the subscription's
 /// takes. Returns that time; 0 if it is unknown.
 #[inline(always)]
 unsafe fn record_wait_since_publication(
@@ -134,22 +135,20 @@ unsafe fn record_wait_since_publication(
     // SAFETY: map values, by the caller.
     unsafe {
         let source = (*thread).source_timestamp;
-        let calendar = realtime_ns(now);
-        if source == 0 || calendar <= source {
+        if source == 0 {
             return 0;
         }
         let input = (*thread).input;
         let Some(subscription) = current.existing_figures(input.address, kind::SUBSCRIPTION) else {
             return 0;
         };
-        let minima = (&raw const (*subscription).minima).cast::<u64>();
-        let minimum_plus_one = read_volatile(minima.add(distribution::DELAY));
-        let delay = calendar - source;
-        if minimum_plus_one == 0 || delay < minimum_plus_one - 1 {
+        let base = read_volatile(&raw const (*subscription).base_delay);
+        if base == 0 {
             return 0;
         }
-        record_duration(figures, distribution::DELAY, delay - (minimum_plus_one - 1));
-        delay - (minimum_plus_one - 1)
+        let wait = base_delay::wait(base, realtime_ns(now).wrapping_sub(source) as i64, now);
+        record_duration(figures, distribution::DELAY, wait);
+        wait
     }
 }
 

@@ -2,7 +2,7 @@
 
 use core::ptr::{read_volatile, write_volatile};
 
-use ros2probe_wire::inside::{distribution, kind};
+use ros2probe_wire::inside::{base_delay, distribution, kind};
 
 use crate::{
     callbacks,
@@ -71,10 +71,17 @@ pub fn taken(subscription: u64, source_timestamp: u64, has_message: bool) {
     let now = now();
     // SAFETY: as above.
     unsafe { count_event(figures, now) };
-    let calendar = realtime_ns(now);
-    if source_timestamp != 0 && calendar > source_timestamp {
+    if source_timestamp != 0 {
+        let delay = realtime_ns(now).wrapping_sub(source_timestamp) as i64;
         // SAFETY: as above.
-        unsafe { record_duration(figures, distribution::DELAY, calendar - source_timestamp) };
+        unsafe {
+            if delay > 0 {
+                record_duration(figures, distribution::DELAY, delay as u64);
+            }
+            let base = &raw mut (*figures).base_delay;
+            let new = base_delay::after_take(read_volatile(base), delay, now);
+            write_volatile(base, new);
+        }
     }
     if read_global(&CALLBACKS) == 0 {
         return;

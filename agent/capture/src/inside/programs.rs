@@ -343,8 +343,8 @@ impl Tables {
         clear(&mut self.waiting).map_err(failed("WAITING", "remove"))
     }
 
-    /// Forgets the minimum delay of each subscription's messages, from which waits are computed: the
-    /// wall clock was set.
+    /// Forgets the base delay of each subscription, from which waits are measured: the wall clock was
+    /// set.
     ///
     /// # Errors
     /// Fails if the kernel refuses an update.
@@ -359,8 +359,7 @@ impl Tables {
                 continue;
             };
             let mut figures: Figures = zerocopy::transmute!(words);
-            let [_, delay] = &mut figures.minima;
-            if std::mem::take(delay) == 0 {
+            if std::mem::take(&mut figures.base_delay) == 0 {
                 continue;
             }
             let words: FiguresWords = zerocopy::transmute!(figures);

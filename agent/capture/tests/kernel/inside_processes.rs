@@ -11,7 +11,7 @@ use std::fs::File;
 use std::io::{BufRead as _, BufReader, Write as _};
 use std::path::Path;
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use ros2probe_attach::client::Broker;
 use ros2probe_capture::breakpoints::AttachMethod;
@@ -360,6 +360,24 @@ fn callbacks_have_triggers_durations_waits_and_effects() {
         ("inactive", "active")
     );
     assert_eq!(transition.node.as_deref(), Some("/robot1/filter"));
+}
+
+#[test]
+fn messages_of_a_publisher_whose_clock_is_ahead_have_waits() {
+    let mut robot = Robot::new(248, &[], true);
+    robot.attach();
+    let mut process = robot.start();
+    process.run("init");
+    for ahead in [500, 500, 500, 300].map(Duration::from_millis) {
+        let source = SystemTime::now().duration_since(UNIX_EPOCH).unwrap() + ahead;
+        process.run(&format!("relay {} 0", source.as_nanos()));
+    }
+    let report = robot.report(&process);
+    let [callback] = &report.callbacks[..] else {
+        panic!("{report:?}");
+    };
+    let (_, longest) = callback.waits.range().unwrap();
+    assert!((150.0..450.0).contains(&milliseconds(longest)), "{longest:?}");
 }
 
 /// `rmw_fastrtps_cpp` of Lyrical takes messages of buffer topics without `rmw_take`. The process is
