@@ -194,7 +194,11 @@ pub mod base_delay {
     #[must_use]
     pub const fn wait(base: i64, delay: i64, now: u64) -> u64 {
         let wait = delay.wrapping_sub(drift(now)).wrapping_sub(base);
-        if base == 0 || wait < 0 { 0 } else { wait as u64 }
+        if base == 0 || wait < 0 {
+            0
+        } else {
+            wait as u64
+        }
     }
 
     const fn drift(now: u64) -> i64 {

@@ -377,7 +377,10 @@ fn messages_of_a_publisher_whose_clock_is_ahead_have_waits() {
         panic!("{report:?}");
     };
     let (_, longest) = callback.waits.range().unwrap();
-    assert!((150.0..450.0).contains(&milliseconds(longest)), "{longest:?}");
+    assert!(
+        (150.0..450.0).contains(&milliseconds(longest)),
+        "{longest:?}"
+    );
 }
 
 /// `rmw_fastrtps_cpp` of Lyrical takes messages of buffer topics without `rmw_take`. The process is

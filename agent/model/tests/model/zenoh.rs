@@ -2,6 +2,7 @@
 
 mod buffers;
 mod processes;
+mod robot;
 mod routers;
 
 use std::ops::Range;
