@@ -166,19 +166,22 @@ pub struct Figures {
     pub buckets: [[u32; BUCKETS]; 2],
 }
 
-/// The delay that takes of a subscription have without a wait: the shortest one from the source
-/// timestamp to the take, from which waits are measured.
+/// The base delay of a subscription (RFC 6817): the shortest delay from a source timestamp to the
+/// take, from which waits are measured.
 ///
-/// It may be negative, because the timestamp is of the publisher's clock. The clocks of two hosts
-/// drift apart, so it grows by 122 µs per second until a take is earlier: crystals of hosts differ
-/// by less. One number holds it, which is lower by that growth since the machine started. 0 means
-/// that nothing was taken.
+/// It may be negative, because the publisher's clock sets the timestamp. The clocks of two hosts
+/// drift apart, so it grows by 122 µs per second until a take is earlier. The quartz clocks of two
+/// hosts differ by less. The stored number is the base delay less its growth since the machine
+/// started; 0 means that nothing was taken.
 pub mod base_delay {
-    /// The drift is the 2¹³th part of the time.
+    /// The growth is the 2¹³th part of the time.
     const DRIFT_BITS: u32 = 13;
+    /// A take later than this begins a new base delay, in nanoseconds: a clock was set, or the
+    /// message was kept for late subscriptions.
+    const MAX_WAIT_NS: u64 = 60_000_000_000;
 
-    /// Returns the number after a take at the time `now`, `delay` nanoseconds after its source
-    /// timestamp.
+    /// Returns the stored number after a take at the time `now`, `delay` nanoseconds after the
+    /// source timestamp of its message.
     #[inline(always)]
     #[must_use]
     pub const fn after_take(base: i64, delay: i64, now: u64) -> i64 {
@@ -186,7 +189,9 @@ pub mod base_delay {
             0 => 1,
             own => own,
         };
-        if base == 0 || own < base { own } else { base }
+        // The difference of two numbers in order fits into 64 bits without a sign.
+        let is_later = own >= base && own.wrapping_sub(base) as u64 <= MAX_WAIT_NS;
+        if base != 0 && is_later { base } else { own }
     }
 
     /// Returns the nanoseconds by which a delay at the time `now` exceeds the base delay.
@@ -461,29 +466,29 @@ mod tests {
 
     const MS: i64 = 1_000_000;
 
-    /// Base delay and last wait after takes each second with these delays in milliseconds.
-    fn after_takes(delays: impl IntoIterator<Item = i64>) -> (i64, u64) {
+    /// Returns the last wait in nanoseconds, after takes each second with these delays in
+    /// milliseconds.
+    fn wait_after(delays: impl IntoIterator<Item = i64>) -> u64 {
         let (mut base, mut wait, mut now) = (0, 0, 1 << 50);
         for delay in delays {
             base = base_delay::after_take(base, delay * MS, now);
             wait = base_delay::wait(base, delay * MS, now);
             now += 1_000_000_000;
         }
-        (base, wait)
+        wait
     }
 
     #[test]
     fn a_wait_is_measured_from_the_shortest_delay() {
-        let (_, wait) = after_takes([5, 3, 9]);
+        let wait = wait_after([5, 3, 9]);
         assert!((5_870_000..6_000_000).contains(&wait), "{wait}");
-        let (_, wait) = after_takes([5, 3, 2]);
-        assert_eq!(wait, 0);
+        assert_eq!(wait_after([5, 3, 2]), 0);
         assert_eq!(base_delay::wait(0, 7 * MS, 1), 0);
     }
 
     #[test]
     fn a_publisher_whose_clock_is_ahead_has_waits() {
-        let (_, wait) = after_takes([-30, -31, -11]);
+        let wait = wait_after([-30, -31, -11]);
         assert!((19_870_000..20_000_000).contains(&wait), "{wait}");
     }
 
@@ -491,7 +496,7 @@ mod tests {
     fn a_drift_of_a_hundred_microseconds_a_second_is_no_wait() {
         for direction in [1, -1] {
             let hour = (0..3_600).map(|second| direction * second / 10);
-            let (_, wait) = after_takes(hour);
+            let wait = wait_after(hour);
             assert!(wait < 1_000_000, "{wait}");
         }
     }
@@ -499,8 +504,36 @@ mod tests {
     #[test]
     fn a_lasting_wait_of_half_a_second_is_known_for_half_an_hour() {
         let backlog = (0..1_800).map(|second| if second < 10 { 1 } else { 501 });
-        let (_, wait) = after_takes(backlog);
+        let wait = wait_after(backlog);
         assert!(wait > 250_000_000, "{wait}");
+    }
+
+    #[test]
+    fn a_publisher_whose_clock_was_set_back_has_waits_from_its_new_time() {
+        const HOUR: i64 = 3_600_000;
+        assert_eq!(wait_after([-HOUR, -HOUR, 3]), 0);
+        let wait = wait_after([-HOUR, -HOUR, 3, 9]);
+        assert!((5_870_000..6_000_000).contains(&wait), "{wait}");
+        // A message that was kept for an hour, between two new ones.
+        let wait = wait_after([3, HOUR, 3, 9]);
+        assert!((5_870_000..6_000_000).contains(&wait), "{wait}");
+    }
+
+    #[test]
+    fn a_forged_timestamp_affects_only_its_own_message() {
+        for forged in [i64::MIN, i64::MIN + 1, -1, 0, 1, i64::MAX] {
+            let mut base = base_delay::after_take(0, 3 * MS, 1 << 50);
+            base = base_delay::after_take(base, forged, 1 << 50);
+            assert!(base_delay::wait(base, forged, 1 << 50) <= 60_000_000_000);
+            for delay in [3, 3, 9] {
+                base = base_delay::after_take(base, delay * MS, 1 << 50);
+            }
+            let wait = base_delay::wait(base, 9 * MS, 1 << 50);
+            assert!(
+                wait >= 6 * MS as u64 && wait < 10 * MS as u64,
+                "{forged}: {wait}"
+            );
+        }
     }
 
     #[test]
