@@ -335,6 +335,7 @@ pub fn run(options: Options) -> Result<()> {
         log: log.exported_lines(),
         node_logs: Arc::clone(&node_logs),
         exports: Arc::clone(&sources.exports),
+        directory: state.directory().map(|state| state.path().to_owned()),
     };
     let mut exporters = Vec::new();
     if let Some(settings) = export {

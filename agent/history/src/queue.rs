@@ -115,6 +115,18 @@ impl Queue {
         self.files.iter().map(|file| file.blocks.length).sum()
     }
 
+    /// Returns the number of the file of the record that was last read.
+    #[must_use]
+    pub const fn file_of_read(&self) -> u32 {
+        self.reading.0
+    }
+
+    /// Returns whether the file with this number is still there.
+    #[must_use]
+    pub fn has_file(&self, number: u32) -> bool {
+        self.files.iter().any(|file| file.number == number)
+    }
+
     /// Returns whether no record waits.
     #[must_use]
     pub fn is_empty(&self) -> bool {

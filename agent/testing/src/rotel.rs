@@ -43,7 +43,19 @@ pub struct Export {
 impl Rotel {
     /// Starts a receiver at `address`, or on a free port, with its output in `directory`.
     pub fn start(command: &mut Command, directory: &Path, address: Option<SocketAddr>) -> Self {
-        let (address, other) = (address.unwrap_or_else(free_address), free_address());
+        Self::start_at(
+            command,
+            directory,
+            [address.unwrap_or_else(free_address), free_address()],
+        )
+    }
+
+    /// Starts a receiver at these addresses for gRPC and HTTP, with its output in `directory`.
+    pub fn start_at(
+        command: &mut Command,
+        directory: &Path,
+        [address, other]: [SocketAddr; 2],
+    ) -> Self {
         let output = directory.join(format!("rotel-{}", other.port()));
         let child = command
             .arg("start")

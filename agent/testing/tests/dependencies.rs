@@ -154,15 +154,13 @@ const CHOSEN: &[(&str, &str, &str, &[&str])] = &[
 ];
 
 /// Texts that only the chosen packages may contain: the text format of metrics, and services and
-/// variables of OTLP.
+/// variables of OTLP. Types of its requests are those of `opentelemetry-proto`.
 const WRITTEN_BY_PACKAGES: &[&str] = &[
     "# HELP ",
     "# TYPE ",
     "# UNIT ",
     "# EOF",
     "opentelemetry.proto.collector",
-    "ExportLogsServiceRequest",
-    "ExportTraceServiceRequest",
     "OTEL_EXPORTER_OTLP_HEADERS",
     "grpc-status-details-bin",
 ];

@@ -1,10 +1,11 @@
 //! Two hosts of the demo robot, each with an agent and a real OpenTelemetry receiver. Both agents
 //! report the same traces, and a receiver that stops and returns does not disturb the capture.
+//! Events and spans of an outage wait on disk, also while the agent is killed.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, ensure};
 use ros2probe_model::derive::trace::Message;
@@ -13,11 +14,14 @@ use ros2probe_testing::harness::agent::{Agent, Scrape, at_the_sockets_of};
 use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream, robot};
 use ros2probe_testing::harness::process::Process;
+use ros2probe_testing::harness::wait_within;
+use ros2probe_testing::ports::free_address;
 use ros2probe_testing::rotel::{Item, Rotel, exports};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, SequenceNumber};
 
 const MESSAGES: u64 = 1_200;
 const DROPPED: &str = "ros2probe_otlp_dropped_total";
+const QUEUE: &str = "ros2probe_otlp_queue_bytes";
 
 fn on(host: &Namespace) -> Command {
     let [enter, network] = host.outside();
@@ -38,6 +42,79 @@ fn configuration(directory: &Path, host: &Namespace, receiver: &Rotel) -> Result
     );
     std::fs::write(&path, yaml)?;
     Ok(path)
+}
+
+#[test]
+fn events_and_spans_of_an_outage_survive_a_kill_of_the_agent_over_grpc() -> Result<()> {
+    an_outage_loses_nothing("grpc")
+}
+
+#[test]
+fn events_and_spans_of_an_outage_survive_a_kill_of_the_agent_over_http() -> Result<()> {
+    an_outage_loses_nothing("http/protobuf")
+}
+
+fn an_outage_loses_nothing(protocol: &str) -> Result<()> {
+    let host = Namespace::isolated()?;
+    let directory = tempfile::tempdir()?;
+    let state = directory.path().join("state");
+    std::fs::create_dir(&state)?;
+    let addresses = [free_address(), free_address()];
+    let address = match protocol {
+        "grpc" => addresses[0],
+        _ => addresses[1],
+    };
+    let configuration = directory.path().join("ros2probe.yaml");
+    let yaml = format!(
+        "watch: [{{topic: /truth, trace: 1.0}}]\nstate_directory: {}\n\
+         otlp: {{endpoint: 'http://{address}', protocol: {protocol}, timeout_s: 2, \
+         metrics: false}}\n{}",
+        state.display(),
+        at_the_sockets_of(&host)
+    );
+    std::fs::write(&configuration, yaml)?;
+    let start = || Agent::start(&host, env!("CARGO_BIN_EXE_rp"), &configuration);
+    let mut first = start()?;
+    let stream = Stream {
+        topic: "/truth".to_owned(),
+        ..Stream::small(600)
+    };
+    let peer = |role, node| Peer::start(&host, Stack::Rust, role, &stream, &[node]);
+    let mut subscriber = peer(Role::Subscriber, "/listener")?;
+    let mut publisher = peer(Role::Publisher, "/sensor")?;
+    subscriber.wait_matched()?;
+    publisher.wait_matched()?;
+    publisher.start_sending()?;
+    publisher.wait_sent(Duration::from_secs(60))?;
+    let queued = |page: &Scrape| page.sum(QUEUE, &[("signal", "traces")]);
+    let mut last = (0.0, Instant::now());
+    let quiet = Duration::from_secs(8);
+    wait_within(Duration::from_secs(60), "all spans are on disk", || {
+        let bytes = queued(&first.scrape()?);
+        if bytes > last.0 {
+            last = (bytes, Instant::now());
+        }
+        // Items are written every 5 s.
+        Ok(bytes > 0.0 && last.1.elapsed() > quiet)
+    })?;
+    first.process.signal("KILL")?;
+    first.process.wait(Duration::from_secs(10))?;
+    start()?.process.terminate()?;
+
+    let third = start()?;
+    let page = third.scrape()?;
+    ensure!(queued(&page) > 0.0, "{}", page.0);
+    let mut receiver = Rotel::start_at(&mut on(&host), directory.path(), addresses);
+    third.scrape_until("the queues are empty", |page| page.sum(QUEUE, &[]) < 0.5)?;
+    let started = |text: &str| text.matches("EventName: ros2probe.agent.started\n").count();
+    let text = receiver.wait_for("all events have come", |text| started(text) >= 3);
+    let sent: Vec<u64> = spans(&text, "send /truth").into_keys().collect();
+    let span = text.matches("Name           : send /truth\n").count();
+    ensure!(sent == (1..=600).collect::<Vec<_>>(), "{sent:?}");
+    ensure!(span == 600 && started(&text) == 3, "{span} spans");
+    let page = third.scrape()?;
+    ensure!(page.sum(DROPPED, &[]) < 0.5, "{}", page.0);
+    Ok(())
 }
 
 /// Returns the spans of this name by sequence number.

@@ -50,6 +50,7 @@ fn page(snapshot: Snapshot, settings: Settings, format: Format) -> String {
     let state = sources.latest.publish(snapshot, sample_robot::agent());
     sources.limits.note(&state);
     sources.exports.enable(Signal::Metrics);
+    sources.exports.enable(Signal::Events);
     sources.remote_write.enable();
     sources.ros2_daemon.set_port(0, PortState::Listening);
     let state = tempfile::tempdir().unwrap();

@@ -813,6 +813,7 @@ fn otlp(shape: OtlpShape) -> OtlpSettings {
         }),
         robot: shape.robot,
         attributes: shape.attributes.unwrap_or_default(),
+        queue_bytes: shape.queue_bytes,
     }
 }
 

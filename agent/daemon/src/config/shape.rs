@@ -680,6 +680,11 @@ pub(super) struct OtlpShape {
     pub(super) robot: Option<String>,
     /// Additional attributes of the resource, names and values.
     pub(super) attributes: Option<BTreeMap<String, String>>,
+    /// Maximum size of the events that wait in `state_directory` while the receiver is out of reach,
+    /// in bytes, and of spans, lines and messages each; 0 = none, default 33554432, at least 1048576.
+    /// The oldest are dropped if it is full.
+    #[schemars(range(min = 0, max = 1_099_511_627_776_u64))]
+    pub(super) queue_bytes: Option<u64>,
 }
 
 /// Push to a receiver of Prometheus remote write.

@@ -18,7 +18,7 @@ use crate::settings_cell::Reload;
 use crate::snapshot_cell::State;
 use ros2probe_metrics::catalogue as metric;
 use ros2probe_metrics::metric_sink::{Label, MetricSink};
-use ros2probe_metrics::otlp::{Exports, Outcome, Reason};
+use ros2probe_metrics::otlp::{Exports, Outcome, Reason, Signal};
 use ros2probe_metrics::remote_write::{Figures, Request, SampleFate};
 use ros2probe_model::facts::dispatch::MissedReason;
 
@@ -369,6 +369,14 @@ pub(super) fn exports(sink: &mut MetricSink<'_>, exports: &Exports) -> fmt::Resu
             }
         }
         Ok(())
+    })?;
+    sink.family(&metric::OTLP_QUEUE, |family| {
+        // Points of metrics do not wait: newer ones replace them.
+        let mut signals = exports.signals().filter(|it| *it != Signal::Metrics);
+        signals.try_for_each(|signal| {
+            let labels = [Label::Text(signal.label())];
+            family.sample(&labels, exports.queue_bytes(signal))
+        })
     })
 }
 

@@ -128,6 +128,7 @@ fn start(address: SocketAddr, interval: u32, more: &str, sources: &MetricSources
         log: None,
         node_logs: Arc::default(),
         exports: Arc::clone(&sources.exports),
+        directory: None,
     };
     otlp::start(settings.unwrap(), inputs, crate::privilege::spawn_export).unwrap()
 }

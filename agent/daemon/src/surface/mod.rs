@@ -12,6 +12,8 @@ mod connection;
 mod delivery_metrics;
 mod diagnosis_metrics;
 #[cfg(test)]
+mod export_queue_tests;
+#[cfg(test)]
 mod export_tests;
 pub mod field_metrics;
 pub mod foxglove;

@@ -251,6 +251,12 @@ pub const OTLP_DROPPED: Metric = Metric::counter(
      superseded (by newer points), refused, rejected (in part) or \
      shutdown.",
 );
+pub const OTLP_QUEUE: Metric = Metric::gauge(
+    "ros2probe_otlp_queue_bytes",
+    &["signal"],
+    "Events, spans and log records that wait on disk for the OTLP endpoint, in bytes; at most otlp.queue_bytes.",
+)
+.unit("bytes");
 pub const REMOTE_WRITE_REQUESTS: Metric = Metric::counter(
     "ros2probe_remote_write_requests_total",
     &["outcome"],

@@ -1,9 +1,11 @@
 //! Delivery of one signal, in order and with bounded memory.
 //!
 //! The library repeats a request within its timeout. The delivery then offers the same batch again,
-//! until the receiver accepts or refuses it. Only one batch is in progress, and callers collect no
-//! other before it is settled. Undelivered items are counted by reason.
+//! until the receiver accepts or refuses it. Only one batch is in progress. Undelivered items are
+//! counted by reason. `queued.rs` lets items wait on disk.
 
+use std::cell::Cell;
+use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -12,13 +14,11 @@ use tokio::time::{Instant, sleep, timeout_at};
 use tokio_util::sync::CancellationToken;
 
 use super::exports::{Exports, Outcome, Reason, Signal};
+use super::kept::{Kept, KeptRequest};
 use super::reports::Report;
 
-/// Pauses before a batch is offered again.
-const FIRST_RETRY_DELAY: Duration = Duration::from_secs(1);
-const MAX_RETRY_DELAY: Duration = Duration::from_secs(30);
 /// Time for the last batches, of the two seconds for stopping.
-const LAST_BATCH_TIMEOUT: Duration = Duration::from_millis(1_400);
+pub(super) const LAST_BATCH_TIMEOUT: Duration = Duration::from_millis(1_400);
 
 /// An exporter of the library and the form of its batches.
 pub(super) trait Export {
@@ -32,6 +32,15 @@ pub(super) trait Export {
     async fn export(&self, batch: &Self::Batch) -> OTelSdkResult;
 }
 
+/// An exporter of items that may wait on disk.
+pub(super) trait Persist: Export {
+    /// Returns the request with these items in the form of the protocol.
+    fn encode(&self, batch: &Self::Batch) -> Vec<u8>;
+
+    /// Sends such a request once.
+    async fn export_encoded(&self, request: &[u8]) -> OTelSdkResult;
+}
+
 /// Items that wait for the exporter.
 pub(super) trait Queue {
     /// The exporter's form of items.
@@ -39,6 +48,9 @@ pub(super) trait Queue {
 
     /// Completes once the queue has items.
     async fn wait_filled(&self);
+
+    /// Returns whether more items should be taken soon, because the queue is half full.
+    fn is_half_full(&self) -> bool;
 
     /// Returns the oldest items, or `None` without any, and the number of items that did not fit.
     fn take(&mut self) -> (Option<Self::Batch>, u64);
@@ -52,7 +64,36 @@ pub(super) struct Delivery<E> {
     exports: Arc<Exports>,
     stop: CancellationToken,
     /// Whether the last request succeeded; `None` before the first.
-    is_working: Option<bool>,
+    is_working: Cell<Option<bool>>,
+}
+
+/// Pauses before a batch is offered again: each is twice as long as the one before it.
+pub(super) struct Pauses(Duration);
+
+impl Default for Pauses {
+    fn default() -> Self {
+        Self(Duration::from_secs(1))
+    }
+}
+
+impl Pauses {
+    const MAX: Duration = Duration::from_secs(30);
+
+    /// Returns the next pause.
+    pub(super) fn next(&mut self) -> Duration {
+        let pause = self.0;
+        self.0 = (pause * 2).min(Self::MAX);
+        pause
+    }
+}
+
+/// Result of one attempt to deliver items.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Attempt {
+    /// The receiver accepted or refused them.
+    Settled,
+    /// They must be offered again.
+    Unsettled,
 }
 
 /// Result of the delivery of a batch.
@@ -81,7 +122,7 @@ impl<E: Export> Delivery<E> {
             endpoint,
             exports,
             stop,
-            is_working: None,
+            is_working: Cell::new(None),
         }
     }
 
@@ -95,58 +136,22 @@ impl<E: Export> Delivery<E> {
         self.drop(Reason::Overflow, items);
     }
 
-    /// Delivers the items of a queue until the agent stops. Items that arrive within `gather` after
-    /// the first one are collected into the same request.
-    pub(super) async fn drain(mut self, mut queue: impl Queue<Batch = E::Batch>, gather: Duration) {
-        let mut left = Vec::new();
-        while left.is_empty() {
-            let gathered = async {
-                queue.wait_filled().await;
-                sleep(gather).await;
-            };
-            tokio::select! {
-                () = gathered => {}
-                () = self.wait_stopped() => break,
-            }
-            while let Some(batch) = self.next(&mut queue) {
-                if self.deliver(&batch, None).await == BatchResult::Stopped {
-                    left.push(batch);
-                    break;
-                }
-            }
-        }
-        left.extend(std::iter::from_fn(|| self.next(&mut queue)));
-        self.finish(left).await;
-    }
-
-    fn next(&self, queue: &mut impl Queue<Batch = E::Batch>) -> Option<E::Batch> {
+    /// Takes the oldest items of a queue, and counts those that did not fit.
+    pub(super) fn take(&self, queue: &mut impl Queue<Batch = E::Batch>) -> Option<E::Batch> {
         let (batch, overflowed) = queue.take();
         self.overflowed(overflowed);
         batch
     }
 
     /// Delivers a batch until it is answered, until `newer`, or until the agent stops.
-    pub(super) async fn deliver(
-        &mut self,
-        batch: &E::Batch,
-        newer: Option<Instant>,
-    ) -> BatchResult {
-        let stop = self.stop.clone();
-        let settled = {
-            let offers = async {
-                let Some(newer) = newer else {
-                    self.send_until_settled(batch).await;
-                    return BatchResult::Answered;
-                };
-                match timeout_at(newer, self.send_until_settled(batch)).await {
-                    Ok(()) => BatchResult::Answered,
-                    Err(_) => BatchResult::Overtaken,
-                }
-            };
-            tokio::select! {
-                settled = offers => settled,
-                () = stop.cancelled() => BatchResult::Stopped,
-            }
+    pub(super) async fn deliver(&self, batch: &E::Batch, newer: Instant) -> BatchResult {
+        let offers = timeout_at(newer, self.send_until_settled(batch));
+        let settled = tokio::select! {
+            answered = offers => match answered {
+                Ok(()) => BatchResult::Answered,
+                Err(_) => BatchResult::Overtaken,
+            },
+            () = self.wait_stopped() => BatchResult::Stopped,
         };
         if settled == BatchResult::Overtaken {
             self.failed("no answer before the next export");
@@ -162,11 +167,11 @@ impl<E: Export> Delivery<E> {
     }
 
     /// Sends the last batches once each, until one fails.
-    pub(super) async fn finish(mut self, batches: Vec<E::Batch>) {
+    pub(super) async fn finish(self, batches: Vec<E::Batch>) {
         let deadline = Instant::now() + LAST_BATCH_TIMEOUT;
         let mut left = batches.iter();
         while let Some(batch) = left.next() {
-            let sent = timeout_at(deadline, self.send(batch, false)).await;
+            let sent = timeout_at(deadline, self.send(self.exporter.export(batch), false)).await;
             if let Ok(Err((error, _))) = &sent {
                 self.failed(error);
                 self.count(Outcome::Failed);
@@ -179,25 +184,48 @@ impl<E: Export> Delivery<E> {
     }
 
     /// Offers a batch until the receiver accepts or refuses it.
-    async fn send_until_settled(&mut self, batch: &E::Batch) {
-        let (mut pause, mut is_again) = (FIRST_RETRY_DELAY, false);
-        while let Err((error, is_refused)) = self.send(batch, is_again).await {
-            self.failed(&error);
-            if is_refused {
-                self.count(Outcome::Failed);
-                return self.drop(Reason::Refused, E::items(batch));
-            }
+    async fn send_until_settled(&self, batch: &E::Batch) {
+        let (mut pauses, mut is_again) = (Pauses::default(), false);
+        while self.offer(batch, is_again).await == Attempt::Unsettled {
             is_again = true;
-            sleep(pause).await;
-            pause = (pause * 2).min(MAX_RETRY_DELAY);
+            sleep(pauses.next()).await;
         }
     }
 
-    /// Sends a batch and counts a success. An error includes whether the receiver refuses the
-    /// batch.
-    async fn send(&mut self, batch: &E::Batch, is_again: bool) -> Result<(), (String, bool)> {
+    /// Offers a batch once. `is_again`: this batch was offered before.
+    pub(super) async fn offer(&self, batch: &E::Batch, is_again: bool) -> Attempt {
+        let export = self.exporter.export(batch);
+        self.attempt(export, E::items(batch), is_again).await
+    }
+
+    /// Runs an export of this number of items, and counts a refusal.
+    async fn attempt(
+        &self,
+        export: impl Future<Output = OTelSdkResult>,
+        items: u64,
+        is_again: bool,
+    ) -> Attempt {
+        let Err((error, is_refused)) = self.send(export, is_again).await else {
+            return Attempt::Settled;
+        };
+        self.failed(&error);
+        if !is_refused {
+            return Attempt::Unsettled;
+        }
+        self.count(Outcome::Failed);
+        self.drop(Reason::Refused, items);
+        Attempt::Settled
+    }
+
+    /// Runs an export and counts a success. An error includes whether the receiver refuses the
+    /// items.
+    async fn send(
+        &self,
+        export: impl Future<Output = OTelSdkResult>,
+        is_again: bool,
+    ) -> Result<(), (String, bool)> {
         let report = Report::new(self.signal, Arc::clone(&self.exports), is_again);
-        let (result, report) = report.of(self.exporter.export(batch)).await;
+        let (result, report) = report.of(export).await;
         match result {
             Ok(()) => {
                 self.delivered(report.rejected());
@@ -214,9 +242,8 @@ impl<E: Export> Delivery<E> {
         }
     }
 
-    fn delivered(&mut self, rejected: u64) {
-        if self.is_working != Some(true) {
-            self.is_working = Some(true);
+    fn delivered(&self, rejected: u64) {
+        if self.is_working.replace(Some(true)) != Some(true) {
             tracing::info!(
                 signal = self.signal.label(),
                 endpoint = self.endpoint,
@@ -232,9 +259,8 @@ impl<E: Export> Delivery<E> {
     }
 
     /// Logs the first failure until a request succeeds again.
-    fn failed(&mut self, reason: &str) {
-        if self.is_working != Some(false) {
-            self.is_working = Some(false);
+    fn failed(&self, reason: &str) {
+        if self.is_working.replace(Some(false)) != Some(false) {
             tracing::warn!(
                 signal = self.signal.label(),
                 endpoint = self.endpoint,
@@ -248,9 +274,30 @@ impl<E: Export> Delivery<E> {
         self.exports.count_request(self.signal, outcome);
     }
 
-    fn drop(&self, reason: Reason, items: u64) {
+    pub(super) fn drop(&self, reason: Reason, items: u64) {
         if items > 0 {
             self.exports.count_dropped(self.signal, reason, items);
+        }
+    }
+}
+
+impl<E: Persist> Delivery<E> {
+    /// Opens the signal's queue on disk.
+    pub(super) fn open_queue(&self, directory: &Path, limit: u64) -> Option<Kept> {
+        Kept::open(directory, limit, self.signal, &self.exports)
+    }
+
+    /// Offers a request that waited on disk. `is_again`: this process offered it before.
+    pub(super) async fn offer_kept(&self, request: &KeptRequest, is_again: bool) -> Attempt {
+        let export = self.exporter.export_encoded(&request.encoded);
+        self.attempt(export, request.items, is_again).await
+    }
+
+    /// Returns the request for these items, which can wait on disk.
+    pub(super) fn kept(&self, batch: &E::Batch) -> KeptRequest {
+        KeptRequest {
+            items: E::items(batch),
+            encoded: self.exporter.encode(batch),
         }
     }
 }

@@ -8,15 +8,7 @@
 //! are not finite (issue 3656), but an unknown lag is infinite. This module can be removed once the
 //! SDK accepts such points.
 
-use std::io::Write as _;
-use std::sync::{Arc, PoisonError};
-
-use flate2::write::GzEncoder;
-use opentelemetry_http::{HttpClient, Request as HttpRequest};
-use opentelemetry_proto::tonic::collector::metrics::v1::metrics_service_client::MetricsServiceClient;
-use opentelemetry_proto::tonic::collector::metrics::v1::{
-    ExportMetricsServiceRequest, ExportMetricsServiceResponse,
-};
+use opentelemetry_proto::tonic::collector::metrics::v1::ExportMetricsServiceRequest;
 use opentelemetry_proto::tonic::common::v1::{InstrumentationScope, KeyValue};
 use opentelemetry_proto::tonic::metrics::v1::{
     AggregationTemporality, Exemplar as EncodedExemplar, Gauge, Histogram as HistogramFamily,
@@ -24,17 +16,7 @@ use opentelemetry_proto::tonic::metrics::v1::{
     metric::Data, number_data_point,
 };
 use opentelemetry_proto::tonic::resource::v1::Resource;
-use opentelemetry_sdk::error::{OTelSdkError, OTelSdkResult};
-use prost::Message as _;
-use tonic::Code;
-use tonic::codec::CompressionEncoding;
-use tonic::codegen::http::Uri;
-use tonic::codegen::http::header::CONTENT_ENCODING;
-use tonic::metadata::MetadataMap;
-use tonic::transport::Channel;
 
-use super::reports;
-use super::transport::SentHeaders;
 use crate::catalogue::Metric;
 use ros2probe_model::derive::chain::exemplar::Exemplar;
 use ros2probe_model::facts::histogram::Histogram;
@@ -161,112 +143,4 @@ fn encoded(exemplar: &Exemplar) -> EncodedExemplar {
         value: Some(exemplar::Value::AsDouble(exemplar.seconds)),
         ..EncodedExemplar::default()
     }
-}
-
-/// Sends requests with such points over the connection of an exporter, with the exporter's headers.
-pub(super) struct EncodedSender {
-    protocol: Protocol,
-    headers: SentHeaders,
-}
-
-enum Protocol {
-    Grpc(MetricsServiceClient<Channel>),
-    Http(Arc<dyn HttpClient>, Uri),
-}
-
-impl EncodedSender {
-    pub(super) fn grpc(channel: Channel, gzip: bool, headers: SentHeaders) -> Self {
-        let mut client =
-            MetricsServiceClient::new(channel).accept_compressed(CompressionEncoding::Gzip);
-        if gzip {
-            client = client.send_compressed(CompressionEncoding::Gzip);
-        }
-        Self {
-            protocol: Protocol::Grpc(client),
-            headers,
-        }
-    }
-
-    pub(super) fn http(client: Arc<dyn HttpClient>, endpoint: Uri, headers: SentHeaders) -> Self {
-        Self {
-            protocol: Protocol::Http(client, endpoint),
-            headers,
-        }
-    }
-
-    /// Sends a request once. The delivery offers a failed request again, until the next collection
-    /// replaces it. The exporter has sent the other points before, so its headers are known.
-    pub(super) async fn send(&self, request: &ExportMetricsServiceRequest) -> OTelSdkResult {
-        let headers = self
-            .headers
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .clone();
-        let response = match &self.protocol {
-            Protocol::Grpc(client) => {
-                reports::attempt();
-                let mut request = tonic::Request::new(request.clone());
-                *request.metadata_mut() = MetadataMap::from_headers(headers);
-                match client.clone().export(request).await {
-                    Ok(response) => response.into_inner(),
-                    Err(status) => {
-                        if is_final(status.code()) {
-                            reports::refused();
-                        }
-                        let code = format!("export failed with gRPC code: {:?}", status.code());
-                        let source = std::error::Error::source(&status);
-                        return failure(match source {
-                            Some(source) => format!("{code}: {source}"),
-                            None => code,
-                        });
-                    }
-                }
-            }
-            Protocol::Http(client, endpoint) => {
-                let mut body = request.encode_to_vec();
-                if headers.get(CONTENT_ENCODING).is_some_and(|it| it == "gzip") {
-                    let mut gzip = GzEncoder::new(Vec::new(), flate2::Compression::default());
-                    // Writing to memory cannot fail.
-                    let _ = gzip.write_all(&body);
-                    body = gzip.finish().unwrap_or_default();
-                }
-                let mut request = HttpRequest::new(body.into());
-                *request.method_mut() = tonic::codegen::http::Method::POST;
-                *request.uri_mut() = endpoint.clone();
-                *request.headers_mut() = headers;
-                let response = match client.send_bytes(request).await {
-                    Ok(response) => response,
-                    Err(error) => return failure(error.to_string()),
-                };
-                if !response.status().is_success() {
-                    if ![429, 502, 503, 504].contains(&response.status().as_u16()) {
-                        reports::refused();
-                    }
-                    return failure(format!("export failed with status {}", response.status()));
-                }
-                ExportMetricsServiceResponse::decode(response.into_body()).unwrap_or_default()
-            }
-        };
-        if let Some(partial) = response.partial_success {
-            reports::rejected(partial.rejected_data_points);
-        }
-        Ok(())
-    }
-}
-
-fn failure(reason: String) -> OTelSdkResult {
-    Err(OTelSdkError::InternalFailure(reason))
-}
-
-/// Returns whether a request must not be repeated (OTLP 1.x, "Failures").
-const fn is_final(code: Code) -> bool {
-    !matches!(
-        code,
-        Code::Cancelled
-            | Code::DeadlineExceeded
-            | Code::Aborted
-            | Code::OutOfRange
-            | Code::Unavailable
-            | Code::DataLoss
-    )
 }

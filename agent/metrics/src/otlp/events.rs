@@ -1,8 +1,8 @@
 //! Export of events as log records with an event name, in the order and with the texts of the event
 //! log.
 //!
-//! No queue is needed: the event log keeps the last events, and the exporter keeps its position in
-//! it. Events that are overwritten while the receiver is unavailable are counted.
+//! No queue in memory is needed: the event log keeps the last events, and the exporter keeps its
+//! position in it. Events that are overwritten before they are exported are counted.
 
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
@@ -10,13 +10,19 @@ use std::time::{Duration, SystemTime};
 use opentelemetry::InstrumentationScope;
 use opentelemetry::logs::{AnyValue, LogRecord as _, Logger as _, LoggerProvider as _, Severity};
 use opentelemetry_otlp::LogExporter;
+use opentelemetry_proto::tonic::collector::logs::v1::ExportLogsServiceRequest;
+use opentelemetry_proto::transform::common::tonic::ResourceAttributesWithSchema;
+use opentelemetry_proto::transform::logs::tonic::group_logs_by_resource_and_scope;
 use opentelemetry_sdk::error::OTelSdkResult;
 use opentelemetry_sdk::logs::{
     LogBatch, LogExporter as _, SdkLogRecord, SdkLogger, SdkLoggerProvider,
 };
+use prost::Message as _;
 use ros2probe_wire::Timestamp;
 
-use super::delivery::{Export, Queue};
+use super::delivery::{Export, Persist, Queue};
+use super::encoded_sender::EncodedSender;
+use super::reports;
 use crate::event::{self, Batch, EventSource, Record, Value};
 
 /// Time for which events are collected into one request.
@@ -28,6 +34,16 @@ const MAX_EVENTS: usize = 256;
 pub(super) struct LogExport {
     pub(super) exporter: LogExporter,
     pub(super) scope: InstrumentationScope,
+    pub(super) resource: ResourceAttributesWithSchema,
+    /// Sends requests that waited on disk.
+    pub(super) encoded: EncodedSender,
+}
+
+impl LogExport {
+    async fn export_records(&self, batch: &[SdkLogRecord]) -> OTelSdkResult {
+        let records: Vec<_> = batch.iter().map(|record| (record, &self.scope)).collect();
+        self.exporter.export(LogBatch::new(&records)).await
+    }
 }
 
 impl Export for LogExport {
@@ -38,8 +54,25 @@ impl Export for LogExport {
     }
 
     async fn export(&self, batch: &Vec<SdkLogRecord>) -> OTelSdkResult {
+        self.export_records(batch).await
+    }
+}
+
+impl Persist for LogExport {
+    fn encode(&self, batch: &Vec<SdkLogRecord>) -> Vec<u8> {
         let records: Vec<_> = batch.iter().map(|record| (record, &self.scope)).collect();
-        self.exporter.export(LogBatch::new(&records)).await
+        let batch = LogBatch::new(&records);
+        let resource_logs = group_logs_by_resource_and_scope(&batch, &self.resource);
+        ExportLogsServiceRequest { resource_logs }.encode_to_vec()
+    }
+
+    async fn export_encoded(&self, request: &[u8]) -> OTelSdkResult {
+        if !self.encoded.has_headers() {
+            reports::unreported(self.export_records(&[])).await?;
+        }
+        self.encoded
+            .send_encoded::<ExportLogsServiceRequest>(request)
+            .await
     }
 }
 
@@ -85,6 +118,11 @@ impl Queue for Reporter {
 
     async fn wait_filled(&self) {
         self.log.wait_after(self.place).await;
+    }
+
+    /// The log keeps more events than its limits of rates permit between two writes.
+    fn is_half_full(&self) -> bool {
+        false
     }
 
     fn take(&mut self) -> (Option<Vec<SdkLogRecord>>, u64) {

@@ -1,6 +1,7 @@
 //! The thread of all exports, with its own runtime.
 
 use std::io;
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
@@ -10,13 +11,14 @@ use opentelemetry_sdk::trace::SpanExporter as _;
 use tokio::runtime::{Builder, Runtime};
 use tokio_util::sync::CancellationToken;
 
-use super::delivery::{Delivery, Export};
+use super::delivery::{Delivery, Export, Persist};
 use super::events::{self, LogExport, Reporter};
 use super::exports::{Exports, Signal};
 use super::metrics::{Collector, MetricExport};
 use super::node_logs::{self, NodeLogQueue, NodeLogs};
 use super::own_log::{self, LogQueue};
 use super::points::scope;
+use super::queued::QueuedDelivery;
 use super::reports::Reports;
 use super::settings::{Settings, SettingsError, Target};
 use super::traces::{self, SpanExport, SpanQueue, Tracing};
@@ -40,6 +42,8 @@ pub struct Inputs {
     pub node_logs: Arc<NodeLogQueue>,
     /// Counters of exports.
     pub exports: Arc<Exports>,
+    /// Directory of the queues on disk, if there is one.
+    pub directory: Option<PathBuf>,
 }
 
 /// Why the exporter cannot start.
@@ -87,10 +91,10 @@ pub fn start(settings: Settings, inputs: Inputs, spawn: Spawn) -> Result<ExportT
 /// Work of the thread.
 struct Jobs {
     metrics: Option<(Collector, Delivery<MetricExport>, Duration)>,
-    events: Option<(Reporter, Delivery<LogExport>)>,
-    traces: Option<(Tracing, Delivery<SpanExport>)>,
-    log: Option<(Arc<LogQueue>, Delivery<LogExport>)>,
-    node_logs: Option<(NodeLogs, Delivery<LogExport>)>,
+    events: Option<(Reporter, QueuedDelivery<LogExport>)>,
+    traces: Option<(Tracing, QueuedDelivery<SpanExport>)>,
+    log: Option<(Arc<LogQueue>, QueuedDelivery<LogExport>)>,
+    node_logs: Option<(NodeLogs, QueuedDelivery<LogExport>)>,
 }
 
 impl Jobs {
@@ -110,15 +114,25 @@ impl Jobs {
             exports,
             stop,
             |transport| {
-                let (exporter, encoded) = transport.metrics()?;
-                Ok(MetricExport { exporter, encoded })
+                Ok(MetricExport {
+                    exporter: transport.metrics()?,
+                    encoded: transport.encoded(),
+                })
             },
         )?;
+        let queues = Queues {
+            directory: inputs.directory.filter(|_| settings.queue_bytes > 0),
+            limit: settings.queue_bytes,
+        };
         let logs = |transport: &Transport| {
             let mut exporter = transport.logs()?;
             exporter.set_resource(resource);
-            let scope = scope();
-            Ok(LogExport { exporter, scope })
+            Ok(LogExport {
+                exporter,
+                scope: scope(),
+                resource: resource.into(),
+                encoded: transport.encoded(),
+            })
         };
         let events = delivery(Signal::Events, settings.events, exports, stop, logs)?;
         let log = delivery(Signal::Log, settings.log, exports, stop, logs)?;
@@ -131,7 +145,11 @@ impl Jobs {
             |transport| {
                 let mut exporter = transport.spans()?;
                 exporter.set_resource(resource);
-                Ok(SpanExport(exporter))
+                Ok(SpanExport {
+                    exporter,
+                    resource: resource.into(),
+                    encoded: transport.encoded(),
+                })
             },
         )?;
         let collector = || Collector::new(inputs.metrics, resource, SystemTime::now());
@@ -139,10 +157,10 @@ impl Jobs {
         let reporter = || Reporter::new(inputs.events);
         Ok(Self {
             metrics: metrics.map(|delivery| (collector(), delivery, settings.interval)),
-            events: events.map(|delivery| (reporter(), delivery)),
-            traces: traces.map(|delivery| (tracing, delivery)),
-            log: inputs.log.zip(log),
-            node_logs: node_logs.map(|delivery| (NodeLogs::new(inputs.node_logs), delivery)),
+            events: queues.with(reporter(), events),
+            traces: queues.with(tracing, traces),
+            log: inputs.log.and_then(|lines| queues.with(lines, log)),
+            node_logs: queues.with(NodeLogs::new(inputs.node_logs), node_logs),
         })
     }
 
@@ -154,25 +172,45 @@ impl Jobs {
         };
         let events = async {
             if let Some((reporter, delivery)) = self.events {
-                delivery.drain(reporter, events::BATCH_DELAY).await;
+                delivery.run(reporter, events::BATCH_DELAY).await;
             }
         };
         let traces = async {
             if let Some((tracing, delivery)) = self.traces {
-                delivery.drain(tracing, traces::BATCH_DELAY).await;
+                delivery.run(tracing, traces::BATCH_DELAY).await;
             }
         };
         let log = async {
             if let Some((queue, delivery)) = self.log {
-                delivery.drain(&*queue, own_log::BATCH_DELAY).await;
+                delivery.run(&*queue, own_log::BATCH_DELAY).await;
             }
         };
         let node_logs = async {
             if let Some((logs, delivery)) = self.node_logs {
-                delivery.drain(logs, node_logs::BATCH_DELAY).await;
+                delivery.run(logs, node_logs::BATCH_DELAY).await;
             }
         };
         tokio::join!(metrics, events, traces, log, node_logs);
+    }
+}
+
+/// Where queues on disk are.
+struct Queues {
+    directory: Option<PathBuf>,
+    limit: u64,
+}
+
+impl Queues {
+    /// Adds a queue on disk to a delivery. Returns it with its input.
+    fn with<I, E: Persist>(
+        &self,
+        input: I,
+        delivery: Option<Delivery<E>>,
+    ) -> Option<(I, QueuedDelivery<E>)> {
+        let delivery = delivery?;
+        let directory = self.directory.as_deref();
+        let kept = directory.and_then(|directory| delivery.open_queue(directory, self.limit));
+        Some((input, QueuedDelivery::new(delivery, kept)))
     }
 }
 

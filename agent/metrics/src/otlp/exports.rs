@@ -52,6 +52,7 @@ pub struct Exports {
     enabled: [AtomicBool; Signal::ALL.len()],
     requests: [[AtomicU64; Outcome::ALL.len()]; Signal::ALL.len()],
     dropped: [[AtomicU64; Reason::ALL.len()]; Signal::ALL.len()],
+    queue_bytes: [AtomicU64; Signal::ALL.len()],
 }
 
 impl Signal {
@@ -144,6 +145,21 @@ impl Exports {
         if let Some(count) = find(&self.dropped, signal, reason as usize) {
             count.fetch_add(items, Ordering::Relaxed);
         }
+    }
+
+    /// Sets the size of a signal's queue on disk.
+    pub(super) fn set_queue_bytes(&self, signal: Signal, bytes: u64) {
+        if let Some(size) = self.queue_bytes.get(signal as usize) {
+            size.store(bytes, Ordering::Relaxed);
+        }
+    }
+
+    /// Returns the size of a signal's queue on disk, in bytes.
+    #[must_use]
+    pub fn queue_bytes(&self, signal: Signal) -> u64 {
+        self.queue_bytes
+            .get(signal as usize)
+            .map_or(0, |size| size.load(Ordering::Relaxed))
     }
 
     /// Returns the number of requests with this outcome.

@@ -13,7 +13,7 @@ use opentelemetry_sdk::metrics::exporter::PushMetricExporter as _;
 use tokio::time::{MissedTickBehavior, interval_at};
 
 use super::delivery::{BatchResult, Delivery, Export};
-use super::encoded::EncodedSender;
+use super::encoded_sender::EncodedSender;
 use super::points::{Batch, Collection, Points};
 use crate::metric_sink::MetricSink;
 use crate::metric_source::MetricSource;
@@ -65,7 +65,7 @@ impl Collector {
     }
 
     /// Exports every `period`, and once at the end.
-    pub(super) async fn run(mut self, mut delivery: Delivery<MetricExport>, period: Duration) {
+    pub(super) async fn run(mut self, delivery: Delivery<MetricExport>, period: Duration) {
         // The offset spreads the exports of a fleet that was switched on simultaneously.
         let mut ticks = interval_at(tokio::time::Instant::now() + period / 4, period);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -83,7 +83,7 @@ impl Collector {
                     delivery.superseded(&batch);
                     continue;
                 }
-                is_overtaken = match delivery.deliver(&batch, Some(now + period)).await {
+                is_overtaken = match delivery.deliver(&batch, now + period).await {
                     BatchResult::Answered => false,
                     BatchResult::Overtaken => true,
                     BatchResult::Stopped => {

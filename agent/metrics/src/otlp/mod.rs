@@ -1,21 +1,24 @@
 //! OTLP: metrics, events, traces and the log are pushed to a receiver on a separate thread.
 //!
-//! The receiver may be absent, slow or intermittent. Memory stays bounded, undelivered items are
-//! counted, and the capture never waits. The caller starts the thread, with the privileges of
-//! exports.
+//! The receiver may be absent, slow or intermittent. Events, logs and spans wait on disk. Memory
+//! stays bounded, undelivered items are counted, and the capture never waits. The caller starts the
+//! thread, with the privileges of exports.
 
 mod delivery;
 mod encoded;
+mod encoded_sender;
 mod endpoint;
 mod events;
 mod exporter;
 mod exports;
 mod instruments;
+mod kept;
 mod metrics;
 mod naming;
 mod node_logs;
 mod own_log;
 pub(crate) mod points;
+mod queued;
 mod reports;
 mod resource;
 mod settings;

@@ -68,6 +68,10 @@ impl Queue for NodeLogs {
         self.queue.0.wait_filled().await;
     }
 
+    fn is_half_full(&self) -> bool {
+        self.queue.0.is_half_full()
+    }
+
     /// The sink counts messages that do not fit.
     fn take(&mut self) -> (Option<Vec<SdkLogRecord>>, u64) {
         let taken = self.queue.0.take(MAX_PER_REQUEST);

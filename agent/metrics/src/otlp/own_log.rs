@@ -104,6 +104,11 @@ impl Queue for &LogQueue {
         LogQueue::filled(self).await;
     }
 
+    fn is_half_full(&self) -> bool {
+        let waiting = self.waiting();
+        waiting.lines.len() >= MAX_LINES / 2 || waiting.bytes >= LINES_BYTES / 2
+    }
+
     fn take(&mut self) -> (Option<Vec<SdkLogRecord>>, u64) {
         let overflowed = self.overflowed.swap(0, Ordering::Relaxed);
         (LogQueue::take(self), overflowed)

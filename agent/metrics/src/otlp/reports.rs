@@ -69,6 +69,12 @@ impl Report {
     }
 }
 
+/// Runs an export whose outcome does not belong to the request in progress.
+pub(super) async fn unreported(export: impl Future<Output = OTelSdkResult>) -> OTelSdkResult {
+    let report = Report::new(Signal::Log, Arc::default(), false);
+    report.of(export).await.0
+}
+
 /// Notes that a request is sent; called by the transport.
 pub(super) fn attempt() {
     // Fails outside an export.

@@ -24,6 +24,9 @@ use super::resource::{Host, resource};
 /// Default interval of metric exports, and default timeout of a request.
 const DEFAULT_INTERVAL: Duration = Duration::from_secs(15);
 const DEFAULT_TIMEOUT: Duration = Duration::from_secs(10);
+/// Default and least size of each queue on disk, in bytes.
+const DEFAULT_QUEUE: u64 = 32 << 20;
+const MIN_QUEUE: u64 = 1 << 20;
 /// Maximum size of a file with headers, in bytes.
 const HEADERS_BYTES: u64 = 1 << 20;
 
@@ -63,6 +66,8 @@ pub struct OtlpSettings {
     pub robot: Option<String>,
     /// Additional attributes of the resource.
     pub attributes: BTreeMap<String, String>,
+    /// Maximum size of the queue on disk of each signal but metrics, in bytes; zero = none.
+    pub queue_bytes: Option<u64>,
 }
 
 /// Address of an OpenTelemetry receiver.
@@ -117,6 +122,8 @@ pub struct Settings {
     /// Identity of this host, for ids that depend on it.
     pub(super) host: u128,
     pub(super) interval: Duration,
+    /// Maximum size of each queue on disk, in bytes; zero = none.
+    pub(super) queue_bytes: u64,
     pub(super) metrics: Option<Target>,
     pub(super) events: Option<Target>,
     pub(super) traces: Option<Target>,
@@ -203,6 +210,10 @@ impl Settings {
                     .unwrap_or(DEFAULT_INTERVAL)
                     .max(Duration::from_secs(1))
             }),
+            queue_bytes: match file.queue_bytes {
+                Some(0) => 0,
+                limit => limit.unwrap_or(DEFAULT_QUEUE).max(MIN_QUEUE),
+            },
             metrics: target(Signal::Metrics)?,
             events: target(Signal::Events)?,
             traces: target(Signal::Traces)?,

@@ -15,15 +15,21 @@ use opentelemetry::trace::{
 };
 use opentelemetry::{InstrumentationScope, KeyValue, StringValue};
 use opentelemetry_otlp::SpanExporter;
+use opentelemetry_proto::tonic::collector::trace::v1::ExportTraceServiceRequest;
+use opentelemetry_proto::transform::common::tonic::ResourceAttributesWithSchema;
+use opentelemetry_proto::transform::trace::tonic::group_spans_by_resource_and_scope;
 use opentelemetry_sdk::error::OTelSdkResult;
 use opentelemetry_sdk::trace::{SpanData, SpanEvents, SpanExporter as _, SpanLinks};
+use prost::Message as _;
 use ros2probe_wire::Timestamp;
 
 use self::late_calls::LateSpan;
-use super::delivery::{Export, Queue};
+use super::delivery::{Export, Persist, Queue};
+use super::encoded_sender::EncodedSender;
 use super::events::time;
 use super::exports::{Exports, Reason, Signal};
 use super::points::scope;
+use super::reports;
 use super::waiting::Waiting;
 use crate::tables::WaitingSpans;
 use ros2probe_model::derive::chain::spans::{ChainSpan, ChainSpans};
@@ -100,7 +106,12 @@ impl SpanSink {
 }
 
 /// Exports spans.
-pub(super) struct SpanExport(pub(super) SpanExporter);
+pub(super) struct SpanExport {
+    pub(super) exporter: SpanExporter,
+    pub(super) resource: ResourceAttributesWithSchema,
+    /// Sends requests that waited on disk.
+    pub(super) encoded: EncodedSender,
+}
 
 impl Export for SpanExport {
     type Batch = Vec<SpanData>;
@@ -110,7 +121,23 @@ impl Export for SpanExport {
     }
 
     async fn export(&self, batch: &Vec<SpanData>) -> OTelSdkResult {
-        self.0.export(batch.clone()).await
+        self.exporter.export(batch.clone()).await
+    }
+}
+
+impl Persist for SpanExport {
+    fn encode(&self, batch: &Vec<SpanData>) -> Vec<u8> {
+        let resource_spans = group_spans_by_resource_and_scope(batch.clone(), &self.resource);
+        ExportTraceServiceRequest { resource_spans }.encode_to_vec()
+    }
+
+    async fn export_encoded(&self, request: &[u8]) -> OTelSdkResult {
+        if !self.encoded.has_headers() {
+            reports::unreported(self.exporter.export(Vec::new())).await?;
+        }
+        self.encoded
+            .send_encoded::<ExportTraceServiceRequest>(request)
+            .await
     }
 }
 
@@ -127,6 +154,10 @@ impl Queue for Tracing {
 
     async fn wait_filled(&self) {
         self.queue.0.wait_filled().await;
+    }
+
+    fn is_half_full(&self) -> bool {
+        self.queue.0.is_half_full()
     }
 
     /// The sink counts spans that do not fit.

@@ -3,7 +3,7 @@
 //!
 //! The connections themselves come from tonic and hyper, with rustls. The library's own gRPC
 //! channel sends no HTTP/2 pings, so requests would wait for minutes after a failure of the
-//! network. Points that the SDK cannot carry (`encoded.rs`) use the same connection.
+//! network. Requests that the library cannot send (`encoded_sender.rs`) use the same connection.
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -19,7 +19,7 @@ use tonic::codegen::http::HeaderMap;
 use tonic::metadata::MetadataMap;
 use tonic::transport::{Channel, ClientTlsConfig, Endpoint};
 
-use super::encoded::EncodedSender;
+use super::encoded_sender::EncodedSender;
 use super::reports;
 use super::settings::{SettingsError, Target};
 
@@ -35,8 +35,9 @@ pub(super) struct Transport {
     sent: SentHeaders,
 }
 
-/// Headers of the last request, with those that the library read from the environment.
-pub(super) type SentHeaders = Arc<Mutex<HeaderMap>>;
+/// Headers of the last request, with those that the library read from the environment; `None` if no
+/// request was sent.
+pub(super) type SentHeaders = Arc<Mutex<Option<HeaderMap>>>;
 
 #[derive(Clone)]
 enum Connection {
@@ -65,23 +66,26 @@ impl Transport {
         self.target.endpoint.to_string()
     }
 
-    /// Returns the exporter of metrics, and the sender of points that it cannot carry.
-    pub(super) fn metrics(&self) -> Result<(MetricExporter, EncodedSender), SettingsError> {
+    /// Returns the exporter of metrics.
+    pub(super) fn metrics(&self) -> Result<MetricExporter, SettingsError> {
         let builder = MetricExporter::builder();
-        let exporter = match &self.connection {
+        Ok(match &self.connection {
             Connection::Grpc(channel) => self.grpc(builder.with_tonic(), channel).build()?,
             Connection::Http(client) => self.http(builder.with_http(), client).build()?,
-        };
+        })
+    }
+
+    /// Returns the sender of requests that the exporter cannot send.
+    pub(super) fn encoded(&self) -> EncodedSender {
         let headers = Arc::clone(&self.sent);
-        let sender = match &self.connection {
+        match &self.connection {
             Connection::Grpc(channel) => {
                 EncodedSender::grpc(channel.clone(), self.target.gzip, headers)
             }
             Connection::Http(client) => {
                 EncodedSender::http(Arc::clone(client), self.target.endpoint.clone(), headers)
             }
-        };
-        Ok((exporter, sender))
+        }
     }
 
     /// Returns an exporter of log records.
@@ -108,9 +112,7 @@ impl Transport {
             reports::attempt();
             let mut headers = std::mem::take(request.metadata_mut()).into_headers();
             overwrite(&mut headers, &own);
-            sent.lock()
-                .unwrap_or_else(PoisonError::into_inner)
-                .clone_from(&headers);
+            *sent.lock().unwrap_or_else(PoisonError::into_inner) = Some(headers.clone());
             *request.metadata_mut() = MetadataMap::from_headers(headers);
             Ok(request)
         };
@@ -200,10 +202,7 @@ impl<C: HttpClient> HttpClient for Client<C> {
     async fn send_bytes(&self, mut request: Request<Bytes>) -> Result<Response<Bytes>, HttpError> {
         reports::attempt();
         overwrite(request.headers_mut(), &self.headers);
-        self.sent
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .clone_from(request.headers());
+        *self.sent.lock().unwrap_or_else(PoisonError::into_inner) = Some(request.headers().clone());
         self.client.send_bytes(request).await
     }
 }

@@ -58,6 +58,11 @@ impl<D: Declared, T> Waiting<D, T> {
         waiting.drain(..most).collect()
     }
 
+    /// Returns whether half of the places are taken.
+    pub(super) fn is_half_full(&self) -> bool {
+        self.items().len() >= D::TABLE.entries / 2
+    }
+
     /// Completes once an item waits.
     pub(super) async fn wait_filled(&self) {
         loop {

@@ -1,0 +1,239 @@
+//! Tests of events that wait on disk, with a receiver that comes late, refuses or fails.
+
+use std::collections::VecDeque;
+use std::net::SocketAddr;
+use std::path::Path;
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use opentelemetry_proto::tonic::collector::logs::v1::logs_service_server::{
+    LogsService, LogsServiceServer,
+};
+use opentelemetry_proto::tonic::collector::logs::v1::{
+    ExportLogsServiceRequest, ExportLogsServiceResponse,
+};
+use opentelemetry_proto::tonic::common::v1::any_value::Value;
+use ros2probe_metrics::export_thread::ExportThread;
+use ros2probe_metrics::otlp::{self, Exports, Host, Inputs, Outcome, Reason, Settings, Signal};
+use tokio::net::TcpListener;
+use tonic::transport::server::{Server, TcpIncoming};
+use tonic::{Code, Status};
+
+use crate::agent_facts::SourceKind;
+use crate::config::Config;
+use crate::events::{AgentEvent, EventLog};
+use crate::surface::MetricSources;
+
+/// Header that each request must have, also the first one after a start.
+const TOKEN: &str = "x-robot-token";
+
+/// A receiver of logs, which answers with these failures before it accepts requests.
+#[derive(Clone, Default)]
+struct Receiver {
+    failures: Arc<Mutex<VecDeque<Status>>>,
+    /// Numbers in the events that it accepted.
+    numbers: Arc<Mutex<Vec<i64>>>,
+}
+
+#[tonic::async_trait]
+impl LogsService for Receiver {
+    async fn export(
+        &self,
+        request: tonic::Request<ExportLogsServiceRequest>,
+    ) -> Result<tonic::Response<ExportLogsServiceResponse>, Status> {
+        let token = request.metadata().get(TOKEN);
+        if token.is_none_or(|token| token != "secret") {
+            return Err(Status::unauthenticated("no token"));
+        }
+        let numbers = numbers(request.get_ref());
+        if !numbers.is_empty()
+            && let Some(failure) = self.failures.lock().unwrap().pop_front()
+        {
+            return Err(failure);
+        }
+        self.numbers.lock().unwrap().extend(numbers);
+        Ok(tonic::Response::new(ExportLogsServiceResponse::default()))
+    }
+}
+
+impl Receiver {
+    async fn serve(self, address: SocketAddr) {
+        let listener = TcpListener::bind(address).await.unwrap();
+        let server = Server::builder().add_service(LogsServiceServer::new(self));
+        tokio::spawn(server.serve_with_incoming(TcpIncoming::from(listener)));
+    }
+
+    fn numbers(&self) -> Vec<i64> {
+        self.numbers.lock().unwrap().clone()
+    }
+}
+
+fn numbers(request: &ExportLogsServiceRequest) -> Vec<i64> {
+    let scopes = request.resource_logs.iter().flat_map(|it| &it.scope_logs);
+    let records = scopes.flat_map(|scope| &scope.log_records);
+    let attributes = records.flat_map(|record| &record.attributes);
+    let counts = attributes.filter(|attribute| attribute.key == "count");
+    let values = counts.map(|count| count.value.as_ref().unwrap().value.as_ref().unwrap());
+    let numbers = values.map(|value| match value {
+        Value::IntValue(number) => *number,
+        other => panic!("{other:?}"),
+    });
+    numbers.collect()
+}
+
+/// An agent's event log and its exporter.
+struct Exporting {
+    events: Arc<EventLog>,
+    exports: Arc<Exports>,
+    thread: ExportThread,
+}
+
+impl Exporting {
+    fn start(address: SocketAddr, directory: &Path) -> Self {
+        let yaml = format!(
+            "otlp: {{endpoint: 'http://{address}', metrics: false, traces: false, \
+             timeout_s: 1, headers: {{{TOKEN}: secret}}}}"
+        );
+        let config = Config::parse(yaml.as_bytes()).unwrap();
+        let (host, read) = (Host::default(), crate::file::read_text);
+        let settings = Settings::resolve(&config.otlp, &|_| None, read, &host).unwrap();
+        let settings = settings.unwrap();
+        let sources = MetricSources::new(
+            SourceKind::Replay,
+            crate::settings_cell::Settings::default(),
+        );
+        let inputs = Inputs {
+            metrics: Arc::new(sources.clone()),
+            events: Arc::<EventLog>::clone(&sources.events),
+            spans: Arc::default(),
+            log: None,
+            node_logs: Arc::default(),
+            exports: Arc::clone(&sources.exports),
+            directory: Some(directory.to_owned()),
+        };
+        Self {
+            events: sources.events,
+            exports: sources.exports,
+            thread: otlp::start(settings, inputs, crate::privilege::spawn_export).unwrap(),
+        }
+    }
+
+    /// Records events with these numbers.
+    fn record(&self, numbers: std::ops::RangeInclusive<u64>) {
+        for count in numbers {
+            let what = "packets";
+            self.events.record(AgentEvent::Dropped { what, count });
+        }
+    }
+
+    async fn until(&self, what: &str, holds: impl Fn(&Exports) -> bool) {
+        let deadline = Instant::now() + Duration::from_secs(60);
+        while !holds(&self.exports) {
+            assert!(Instant::now() < deadline, "{what}");
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+    }
+
+    fn dropped(&self) -> u64 {
+        let reasons = Reason::ALL.into_iter();
+        let dropped = reasons.map(|reason| self.exports.dropped(Signal::Events, reason));
+        dropped.sum()
+    }
+}
+
+/// Returns an address at which nothing listens. Each test has a host address of its own, so that no
+/// other test takes the port.
+async fn silent(host: &str) -> SocketAddr {
+    let listener = TcpListener::bind((host, 0)).await.unwrap();
+    listener.local_addr().unwrap()
+}
+
+fn bytes(exports: &Exports) -> u64 {
+    exports.queue_bytes(Signal::Events)
+}
+
+#[tokio::test]
+async fn events_of_an_outage_survive_ends_of_the_agent_and_arrive_once_in_order() {
+    let directory = tempfile::tempdir().unwrap();
+    let address = silent("127.17.41.1").await;
+    let first = Exporting::start(address, directory.path());
+    first.record(1..=10);
+    first.until("a queue", |exports| bytes(exports) > 0).await;
+    first.record(11..=20);
+    first.thread.finish().await;
+
+    let second = Exporting::start(address, directory.path());
+    second.record(21..=30);
+    second.thread.finish().await;
+
+    let receiver = Receiver::default();
+    let details = "when to try again".into();
+    receiver.failures.lock().unwrap().extend([
+        Status::unavailable("so said the test"),
+        Status::with_details(Code::ResourceExhausted, "busy", details),
+    ]);
+    receiver.clone().serve(address).await;
+    let third = Exporting::start(address, directory.path());
+    assert!(bytes(&third.exports) > 0);
+    third.record(31..=40);
+    third
+        .until("all events", |_| receiver.numbers().len() >= 40)
+        .await;
+    third.until("no queue", |exports| bytes(exports) == 0).await;
+    third.record(41..=50);
+    third
+        .until("later events", |_| receiver.numbers().len() >= 50)
+        .await;
+    assert_eq!(receiver.numbers(), (1..=50).collect::<Vec<_>>());
+    let third_dropped = third.dropped();
+    assert_eq!(bytes(&third.exports), 0);
+    third.thread.finish().await;
+    assert_eq!(third_dropped, 0);
+}
+
+#[tokio::test]
+async fn a_refused_request_leaves_the_queue_and_is_counted_and_later_ones_follow() {
+    let directory = tempfile::tempdir().unwrap();
+    let address = silent("127.17.41.2").await;
+    let agent = Exporting::start(address, directory.path());
+    agent.record(1..=10);
+    agent.until("a queue", |exports| bytes(exports) > 0).await;
+    let refused = agent.events.last();
+    let receiver = Receiver::default();
+    let refusal = Status::invalid_argument("so said the test");
+    receiver.failures.lock().unwrap().push_back(refusal);
+    receiver.clone().serve(address).await;
+    agent.until("no queue", |exports| bytes(exports) == 0).await;
+    agent.record(11..=20);
+    agent
+        .until("later events", |_| receiver.numbers().len() >= 10)
+        .await;
+    assert_eq!(receiver.numbers(), (11..=20).collect::<Vec<_>>());
+    let dropped = agent.exports.dropped(Signal::Events, Reason::Refused);
+    assert_eq!((dropped, agent.dropped()), (refused, refused));
+    assert_eq!(agent.exports.requests(Signal::Events, Outcome::Failed), 1);
+    agent.thread.finish().await;
+}
+
+#[tokio::test]
+async fn events_wait_in_memory_where_they_cannot_be_written() {
+    let directory = tempfile::tempdir().unwrap();
+    let file = directory.path().join("file");
+    std::fs::write(&file, "").unwrap();
+    let address = silent("127.17.41.3").await;
+    let agent = Exporting::start(address, &file);
+    agent.record(1..=10);
+    agent
+        .until("a second attempt", |exports| {
+            exports.requests(Signal::Events, Outcome::Retried) > 1
+        })
+        .await;
+    let receiver = Receiver::default();
+    receiver.clone().serve(address).await;
+    agent
+        .until("all events", |_| receiver.numbers().len() >= 10)
+        .await;
+    assert_eq!(receiver.numbers(), (1..=10).collect::<Vec<_>>());
+    assert_eq!((agent.dropped(), bytes(&agent.exports)), (0, 0));
+    agent.thread.finish().await;
+}
