@@ -18,6 +18,9 @@ use super::{Process, Robot};
 /// Calls that take longer are late.
 const BOUND: Duration = Duration::from_millis(5);
 
+/// Maximum number of threads that are named for a span of a late call.
+const MAX_NAMED_THREADS: usize = 4;
+
 /// A process whose late calls are observed, by the scheduler's events.
 pub(super) fn started() -> (Robot, Process) {
     let mut robot = Robot::new(248, &[], true);
@@ -124,7 +127,9 @@ fn a_call_beside_a_busy_thread_names_that_thread() {
         assert!(runnable >= call.duration / 5, "{call:#?}");
         let others = &call.activity.as_ref().unwrap().others;
         let named: Duration = others.iter().map(|other| other.duration).sum();
-        assert!(named * 10 >= runnable * 9, "{call:#?}");
+        // A busy machine has further threads, of which the longest ones are named.
+        let is_whole = others.len() < MAX_NAMED_THREADS;
+        assert!(!is_whole || named * 10 >= runnable * 9, "{call:#?}");
         let hog = others.iter().find(|other| other.process == hog.0.id());
         let hog = hog.unwrap_or_else(|| panic!("{call:#?}"));
         assert_eq!(hog.unit.as_deref(), Some(&*name), "{call:#?}");
