@@ -23,5 +23,6 @@ mod packages;
 mod quiet;
 mod robot;
 mod ros2_daemon;
+mod said;
 mod services;
 mod zenoh;
