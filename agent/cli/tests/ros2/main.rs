@@ -18,6 +18,7 @@ mod incident;
 mod inside;
 mod installed;
 mod large_data;
+mod late;
 mod learn;
 mod packages;
 mod quiet;
