@@ -84,7 +84,7 @@ fn may_be_udp(skb: *mut __sk_buff) -> bool {
 
 #[inline(always)]
 fn process_datagram(skb: *mut __sk_buff, slot: u32, at: u32) -> Option<()> {
-    if packet::parse_ip_packet(skb, slot, at) == 0 {
+    if packet::parse_ip_packet(skb, slot, at, 0) == 0 {
         return None;
     }
     // SAFETY: the verifier rewrites reads of this field; `skb` is the program's context.
@@ -157,18 +157,24 @@ pub fn add_socket(skb: *mut __sk_buff, socket: u64, is_stream: u64) {
     let _ = SOCKETS.insert(socket, socket_entry, 0);
 }
 
-/// Returns a token for the current datagram, and its socket's cookie. `token_count` is per slot,
-/// and only this run holds the slot.
+/// Returns a token for the current datagram, and its socket's cookie.
 #[inline(always)]
 pub fn assign_token(skb: *mut __sk_buff, slot: u32, token_count: &mut u32) -> (u32, u64) {
+    let token = next_token(slot, token_count);
+    // SAFETY: `skb` is the program's context.
+    (token, unsafe { bpf_get_socket_cookie(skb.cast()) })
+}
+
+/// Returns a token for the current datagram or frame. `token_count` is per slot, and only this run
+/// holds the slot.
+#[inline(always)]
+pub fn next_token(slot: u32, token_count: &mut u32) -> u32 {
     *token_count = token_count.wrapping_add(1);
     // SAFETY: no preconditions.
     let cpu = unsafe { bpf_get_smp_processor_id() } as u32;
     // The token is unique among 2^20 datagrams of a CPU if at most 256 CPUs exist. It contains the
     // slot's number plus one, so it is never 0.
-    let token = *token_count << 12 | (slot + 1) << 8 | (cpu & 0xff);
-    // SAFETY: `skb` is the program's context.
-    (token, unsafe { bpf_get_socket_cookie(skb.cast()) })
+    *token_count << 12 | (slot + 1) << 8 | (cpu & 0xff)
 }
 
 /// Returns whether a copy of the current datagram was captured just before. Copies are recognized

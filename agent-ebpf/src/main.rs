@@ -3,7 +3,7 @@
 //!
 //! The crate is thin on purpose: `ros2probe_wire::walk`, which user space runs too, reads
 //! submessages and decides what happens to them. This crate adds the socket buffer, the maps and
-//! the fragments. [`wire`] reads frames on interfaces. [`host_ingress`] and [`host_egress`] read
+//! the fragments. [`wire`], or [`tcx_ingress`] and [`tcx_egress`], read frames on interfaces. [`host_ingress`] and [`host_egress`] read
 //! datagrams at sockets, [`zenoh_ingress`] and [`zenoh_egress`] TCP segments. If enabled,
 //! [`shm_handed`] reads messages in the process that sends them, and [`received_ipv4`] notes when
 //! threads receive datagrams.
@@ -32,14 +32,15 @@ mod registers;
 mod runs;
 mod settings;
 mod socket_full;
+mod tcx;
 mod verdict;
 mod zenoh;
 
 use aya_ebpf::{
     EbpfContext as _,
     bindings::__sk_buff,
-    macros::{cgroup_skb, cgroup_sock_addr, raw_tracepoint, socket_filter, uprobe},
-    programs::{ProbeContext, RawTracePointContext, SkBuffContext, SockAddrContext},
+    macros::{cgroup_skb, cgroup_sock_addr, classifier, raw_tracepoint, socket_filter, uprobe},
+    programs::{ProbeContext, RawTracePointContext, SkBuffContext, SockAddrContext, TcContext},
 };
 use ros2probe_wire::filter::Counter;
 
@@ -56,6 +57,8 @@ use crate::{
 const PACKET_OUTGOING: u32 = 4;
 /// Index of the loopback device in every network namespace.
 const LOOPBACK: u32 = 1;
+/// Return value at tcx: the next program decides, or the kernel after the last one.
+const TCX_NEXT: i32 = -1;
 
 /// Runs for an AF_PACKET SOCK_DGRAM socket and tail-calls [`wire`]. The kernel charges a socket for
 /// the length of its program, which must stay below 20 KB up to Linux 6.7 (`net.core.optmem_max`).
@@ -72,6 +75,22 @@ pub fn wire_entry(context: SkBuffContext) -> i64 {
 #[socket_filter]
 pub fn wire(context: SkBuffContext) -> i64 {
     frame(context.skb.skb).unwrap_or(0)
+}
+
+/// Runs at tcx for a packet that an interface has received. Returns TCX_NEXT, so that the packet
+/// continues as without the program.
+#[classifier]
+pub fn tcx_ingress(context: TcContext) -> i32 {
+    tcx::process_packet(context.skb.skb, hook::TCX_INGRESS);
+    TCX_NEXT
+}
+
+/// Runs as [`tcx_ingress`] does, for a packet that an interface is about to send, after the IP layer
+/// has fragmented it.
+#[classifier]
+pub fn tcx_egress(context: TcContext) -> i32 {
+    tcx::process_packet(context.skb.skb, hook::TCX_EGRESS);
+    TCX_NEXT
 }
 
 /// Runs at a cgroup for a received datagram, which is reassembled and begins at the IP header.
@@ -199,32 +218,35 @@ fn frame(skb: *mut __sk_buff) -> Option<i64> {
 
 #[inline(always)]
 fn claimed(skb: *mut __sk_buff, segments: u32, slot: u32) -> Option<i64> {
-    if packet::parse_ip_packet(skb, slot, hook::INTERFACE) == 0 {
-        if zenoh::filter_tcp_frame(skb, slot, packet::ip_header_offset(skb)) == 0 {
-            return Some(0);
-        }
-        // SAFETY: the verifier rewrites reads of this field.
-        let len = unsafe { (*skb).len };
-        count(slot, Counter::ZenohFrames, 1);
-        count(slot, Counter::CapturedBytes, u64::from(len));
-        return Some(i64::from(len));
+    let start = packet::ip_header_offset(skb);
+    if !keeps_frame(skb, segments, slot, hook::INTERFACE, start)? {
+        return Some(0);
+    }
+    // SAFETY: the verifier rewrites reads of this field.
+    let len = unsafe { (*skb).len };
+    count(slot, Counter::CapturedBytes, u64::from(len));
+    Some(i64::from(len))
+}
+
+/// Returns whether user space needs the frame whose IP header is at `start`; `None` without working
+/// memory. `at` is one of [`hook`].
+#[inline(always)]
+fn keeps_frame(skb: *mut __sk_buff, segments: u32, slot: u32, at: u32, start: u32) -> Option<bool> {
+    if packet::parse_ip_packet(skb, slot, at, start) == 0 {
+        let keep = zenoh::filter_tcp_frame(skb, slot, start) != 0;
+        count(slot, Counter::ZenohFrames, u64::from(keep));
+        return Some(keep);
     }
     if segments > 1 {
         count(slot, Counter::Segmented, 1);
-        return Some(0);
+        return Some(false);
     }
     let keep = if packet::is_fragment(slot)? {
         fragment::process_fragment(skb, slot)
     } else {
         verdict::decide_datagram(skb, slot)
     };
-    if keep == 0 {
-        return Some(0);
-    }
-    // SAFETY: as above.
-    let len = unsafe { (*skb).len };
-    count(slot, Counter::CapturedBytes, u64::from(len));
-    Some(i64::from(len))
+    Some(keep != 0)
 }
 
 #[panic_handler]

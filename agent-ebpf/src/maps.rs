@@ -58,8 +58,8 @@ pub static WAKE_PIECE_BYTES: u64 = 512 * 1024;
 #[unsafe(no_mangle)]
 pub static PREEMPTED: u32 = 1;
 
-/// Whether programs may read packets in place: programs at a cgroup may, programs at an interface
-/// may not. Set by the loader.
+/// Whether programs may read packets in place: programs of packet sockets may not, others may. Set by
+/// the loader.
 #[unsafe(no_mangle)]
 pub static IN_PLACE: u32 = 1;
 
@@ -158,6 +158,12 @@ impl<T: Copy> Shared<T> {
         unsafe { self.0.get().write_volatile(value) }
     }
 
+    /// Returns the address of the value.
+    #[inline(always)]
+    pub const fn as_ptr(&self) -> *mut T {
+        self.0.get()
+    }
+
     /// Copies a whole value out.
     #[inline(always)]
     pub fn load(&self, to: &mut T) {
@@ -234,7 +240,8 @@ pub struct Flow {
     pub token: Shared<u32>,
     /// Offset in the UDP payload at which the walk continues; `u32::MAX` = the walk is over.
     pub walk_offset: Shared<u32>,
-    pub unused: u32,
+    /// Whether `pending_record` may be extended by the next submessage, see `walk::may_continue`.
+    pub may_continue: Shared<u32>,
 }
 
 /// The current IP packet.
@@ -337,6 +344,12 @@ pub struct PieceBuffer {
 #[inline(always)]
 pub fn claim_egress_slot() -> Option<u32> {
     claim_slot(FIRST_EGRESS_SLOT, SCRATCH_SLOTS)
+}
+
+/// Returns whether the kernel preempts code that runs with bottom halves disabled.
+#[inline(always)]
+pub fn is_preempted() -> bool {
+    read_global(&PREEMPTED) != 0
 }
 
 /// Claims a slot as [`claim_egress_slot`] does, for frames and received datagrams. Programs for

@@ -1,6 +1,9 @@
 //! Parses a socket buffer down to the IP payload of a UDP packet.
 
-use aya_ebpf::{bindings::__sk_buff, helpers::generated::bpf_skb_load_bytes};
+use aya_ebpf::{
+    bindings::__sk_buff,
+    helpers::generated::{bpf_skb_load_bytes, bpf_skb_load_bytes_relative},
+};
 use core::mem::MaybeUninit;
 use ros2probe_wire::{filter::Counter, walk};
 
@@ -17,13 +20,24 @@ const MAX_DIRECT_OFFSET: usize = 0x7fff;
 /// The hook at which a program sees a packet. The values are `u32`, because functions of BPF take
 /// and return integers.
 pub mod hook {
-    /// A frame on an interface.
+    /// A frame on an interface, at a packet socket.
     pub const INTERFACE: u32 = 0;
     /// A received datagram at its socket.
     pub const INGRESS: u32 = 1;
     /// A sent datagram at its socket.
     pub const EGRESS: u32 = 2;
+    /// A packet that an interface has received, at tcx.
+    pub const TCX_INGRESS: u32 = 3;
+    /// A packet that an interface is about to send, at tcx.
+    pub const TCX_EGRESS: u32 = 4;
 }
+
+/// `BPF_HDR_START_NET`: offsets count from the IP header.
+const FROM_IP_HEADER: u32 = 1;
+/// Result of [`link_header_len`] if the length is unknown.
+pub const NO_LINK_HEADER: u32 = u32::MAX;
+/// Length of an Ethernet header.
+const ETHERNET_LEN: u32 = 14;
 
 const UDP: u32 = 17;
 /// Third word of an IPv4-mapped address, in memory order.
@@ -59,7 +73,7 @@ pub fn load_bytes<T: Copy>(skb: *mut __sk_buff, offset: u32) -> Option<T> {
 #[inline(always)]
 fn load_direct<T: Copy>(skb: *mut __sk_buff, offset: u32) -> Option<T> {
     if read_global(&IN_PLACE) == 0 {
-        // Programs at interfaces may not read in place; for them the verifier skips the code below.
+        // Programs of packet sockets may not read in place; for them the verifier skips the code below.
         return None;
     }
     let offset = hide_bounds(offset) as usize;
@@ -102,29 +116,84 @@ pub fn is_fragment(slot: u32) -> Option<bool> {
     Some(scratch(slot)?.get().packet.is_fragment != 0)
 }
 
-/// Fills in the scratch packet; returns 1 if the packet is a UDP datagram or a fragment of one.
-/// `at` is one of [`hook`].
+/// Reads the first 20 bytes of the IP header of a packet at tcx. Unlike [`load_bytes`], it reads
+/// only the contiguous part of a packet, which begins with the headers.
+#[inline(always)]
+pub fn load_ip_header(skb: *mut __sk_buff) -> Option<[u32; 5]> {
+    let mut header = MaybeUninit::<[u32; 5]>::uninit();
+    // SAFETY: the destination has the size given; the kernel checks the offset.
+    let result = unsafe {
+        bpf_skb_load_bytes_relative(
+            skb.cast(),
+            0,
+            header.as_mut_ptr().cast(),
+            size_of::<[u32; 5]>() as u32,
+            FROM_IP_HEADER,
+        )
+    };
+    if result != 0 {
+        return None;
+    }
+    // SAFETY: the helper has filled all of it.
+    Some(unsafe { header.assume_init() })
+}
+
+/// Returns the offset of the IP header `header` in a packet at tcx. The packet begins with the header
+/// of the link, if the interface has one. The kernel does not pass the offset on. It follows from the
+/// length of the packet, unless padding follows the packet: short frames of Ethernet have padding.
+/// Returns [`NO_LINK_HEADER`] if the offset is unknown.
+#[inline(always)]
+pub fn link_header_len(skb: *mut __sk_buff, header: &[u32; 5]) -> u32 {
+    let first = u32::from_be(header[0]);
+    let len = match first >> 28 {
+        4 => first & 0xffff,
+        6 => 40 + (u32::from_be(header[1]) >> 16),
+        _ => return NO_LINK_HEADER,
+    };
+    // SAFETY: the verifier rewrites reads of this field.
+    let offset = unsafe { (*skb).len }.wrapping_sub(len);
+    if is_at(skb, header, offset) {
+        offset
+    } else if is_at(skb, header, ETHERNET_LEN) {
+        ETHERNET_LEN
+    } else {
+        NO_LINK_HEADER
+    }
+}
+
+#[inline(always)]
+fn is_at(skb: *mut __sk_buff, header: &[u32; 5], offset: u32) -> bool {
+    load_bytes::<[u32; 5]>(skb, offset).is_some_and(|there| {
+        there[0] == header[0]
+            && there[1] == header[1]
+            && there[2] == header[2]
+            && there[3] == header[3]
+            && there[4] == header[4]
+    })
+}
+
+/// Fills in the scratch packet, whose IP header is at `start`; returns 1 if the packet is a UDP
+/// datagram or a fragment of one. `at` is one of [`hook`].
 // Global (not inlined) functions are verified once each, whatever calls them.
 #[unsafe(no_mangle)]
 #[inline(never)]
-pub extern "C" fn parse_ip_packet(skb: *mut __sk_buff, slot: u32, at: u32) -> u32 {
+pub extern "C" fn parse_ip_packet(skb: *mut __sk_buff, slot: u32, at: u32, start: u32) -> u32 {
     let Some(mut scratch) = scratch(slot) else {
         return 0;
     };
     let packet = &mut scratch.get().packet;
     // SAFETY: the verifier rewrites reads of these fields.
     let (pkt_type, interface) = unsafe { ((*skb).pkt_type, (*skb).ifindex) };
-    let host = at != hook::INTERFACE;
-    // At a socket the packet type is unusable: a sent datagram does not have it yet.
-    let outgoing = if host {
-        at == hook::EGRESS
-    } else {
+    let host = at == hook::INGRESS || at == hook::EGRESS;
+    // Elsewhere the packet type is unusable: a sent datagram does not have it yet.
+    let outgoing = if at == hook::INTERFACE {
         pkt_type == PACKET_OUTGOING
+    } else {
+        at == hook::EGRESS || at == hook::TCX_EGRESS
     };
     packet.is_at_socket = u32::from(host);
     packet.is_outgoing = u32::from(outgoing);
     packet.interface = interface;
-    let start = if host { 0 } else { ip_header_offset(skb) };
     let Some(header) = load_bytes::<[u32; 5]>(skb, start) else {
         return 0;
     };
@@ -140,7 +209,7 @@ pub extern "C" fn parse_ip_packet(skb: *mut __sk_buff, slot: u32, at: u32) -> u3
     1
 }
 
-/// Returns the offset of the IP header in a frame. The kernel strips the outer VLAN tag of received
+/// Returns the offset of the IP header in a frame at a packet socket. The kernel strips the outer VLAN tag of received
 /// frames, but not a second one.
 #[inline(always)]
 pub fn ip_header_offset(skb: *mut __sk_buff) -> u32 {

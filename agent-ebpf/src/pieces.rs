@@ -1,7 +1,10 @@
 //! Writes captured datagrams to the ring in pieces. A program can copy only a bounded length at a
 //! time, and a short discovery datagram should not reserve memory for the longest one.
 
-use aya_ebpf::{bindings::__sk_buff, helpers::generated::bpf_skb_load_bytes};
+use aya_ebpf::{
+    bindings::__sk_buff,
+    helpers::{bpf_ktime_get_ns, generated::bpf_skb_load_bytes},
+};
 use ros2probe_wire::{
     EntityId,
     filter::Counter,
@@ -10,6 +13,7 @@ use ros2probe_wire::{
 };
 
 use crate::{
+    host,
     instructions::hide_bounds,
     maps::{PIECES, PieceBuffer, WAKE_PIECE_BYTES, count, piece_buffer, scratch},
     settings::read_global,
@@ -18,12 +22,19 @@ use crate::{
 
 /// Maximum number of pieces of a UDP datagram.
 const PIECES_PER_DATAGRAM: u32 = 65_536 / PIECE_BYTES;
+/// Maximum length of a frame, from its IP header on. Only packets of TCP can be longer
+/// (`gso_max_size`).
+const MAX_FRAME_BYTES: u32 = 65_535;
 const DATAGRAM_FLAGS: u16 = flag::FRAGMENTED | flag::OUTGOING | flag::IPV6 | flag::HOST;
 
 /// Writer of participant announcements. Participants repeat their announcements, so these do not
 /// wake user space. Every other captured datagram is sent once, and user space should read it
 /// before data that depends on it.
 const SPDP_WRITER: u32 = u32::from_ne_bytes(EntityId::SPDP_WRITER.0);
+
+/// Flags of the kernel: a piece wakes user space if the ring was empty. So one fragment of a captured
+/// message does, and the others do not.
+const WAKEUP_IF_EMPTY: u64 = 0;
 
 const _: () = assert!(PIECE_BYTES.is_power_of_two());
 
@@ -48,6 +59,48 @@ pub extern "C" fn write_capture(skb: *mut __sk_buff, slot: u32) -> u32 {
     piece.flags = record.flags & DATAGRAM_FLAGS;
     let len = scratch.walk.datagram_len;
     let base = packet.payload_offset + 8;
+    let (mut offset, mut piece_count) = (0, 0);
+    while piece_count < PIECES_PER_DATAGRAM {
+        if offset >= len {
+            break;
+        }
+        if write_piece(skb, slot, base, offset) == 0 {
+            count(slot, Counter::PiecesLost, 1);
+            return 0;
+        }
+        offset += PIECE_BYTES;
+        piece_count += 1;
+    }
+    count(slot, Counter::CapturedBytes, u64::from(len));
+    1
+}
+
+/// Writes a frame to the ring, from its IP header on; returns 1 if every piece fit. The lower half of
+/// `place` is the offset of the IP header, the upper half the number of bytes from there.
+#[unsafe(no_mangle)]
+#[inline(never)]
+pub extern "C" fn write_frame(skb: *mut __sk_buff, slot: u32, place: u64) -> u32 {
+    let (Some(mut scratch), Some(mut buffer)) = (scratch(slot), piece_buffer(slot)) else {
+        return 0;
+    };
+    let (base, len) = (place as u32, (place >> 32) as u32);
+    if len > MAX_FRAME_BYTES {
+        count(slot, Counter::PiecesLost, 1);
+        return 0;
+    }
+    let scratch = scratch.get();
+    let piece = &mut buffer.piece;
+    // SAFETY: no preconditions.
+    piece.time = unsafe { bpf_ktime_get_ns() };
+    piece.interface = scratch.packet.interface;
+    piece.datagram = host::next_token(slot, &mut scratch.token_count);
+    piece.datagram_len = len;
+    piece.flags = flag::FRAME
+        | if scratch.packet.is_outgoing != 0 {
+            flag::OUTGOING
+        } else {
+            0
+        };
     let (mut offset, mut piece_count) = (0, 0);
     while piece_count < PIECES_PER_DATAGRAM {
         if offset >= len {
@@ -97,9 +150,12 @@ pub extern "C" fn write_piece(skb: *mut __sk_buff, slot: u32, base: u32, offset:
 /// Writes the piece that the buffer holds to the ring; returns 1 if it fit.
 #[inline(always)]
 pub fn push_piece(slot: u32, buffer: &mut PieceBuffer) -> u32 {
-    let wake = if scratch(slot)
+    let wake = if PIECES.query(RING_AVAIL_DATA) > read_global(&WAKE_PIECE_BYTES) {
+        FORCE_WAKEUP
+    } else if buffer.piece.flags & flag::FRAME != 0 {
+        WAKEUP_IF_EMPTY
+    } else if scratch(slot)
         .is_some_and(|mut scratch| scratch.get().walk.record.writer[3] != SPDP_WRITER)
-        || PIECES.query(RING_AVAIL_DATA) > read_global(&WAKE_PIECE_BYTES)
     {
         FORCE_WAKEUP
     } else {

@@ -85,6 +85,8 @@ pub mod flag {
     pub const RELAYED: u16 = 1 << 12;
     /// The message came by a TCP connection that carries RTPS, from [`super::Record::source_port`].
     pub const TCP: u16 = 1 << 13;
+    /// Of a piece: the bytes are those of a frame on an interface, from its IP header on.
+    pub const FRAME: u16 = 1 << 14;
 }
 
 /// One submessage of one writer or reader. 136 bytes.

@@ -237,6 +237,87 @@ pub fn step<B: Bytes>(walk: &mut Walk, bytes: &B, present: u32) -> Step {
     found
 }
 
+/// Returns whether [`continue_fragments`] may extend `record`, the last one of a walk: a DATA_FRAG
+/// without inline QoS, after which the receiver state has not changed.
+#[inline(always)]
+#[must_use]
+pub fn may_continue(walk: &Walk, record: &Record) -> bool {
+    let timestamp = (walk.timestamp[0] as u64) << 32 | walk.timestamp[1] as u64;
+    record.kind == kind::DATA_FRAG
+        && u32::from(record.submessage_flags) & INLINE_QOS == 0
+        && record.source_timestamp == timestamp
+        && record.writer[0] == walk.source[0]
+        && record.writer[1] == walk.source[1]
+        && record.writer[2] == walk.source[2]
+        && record.reader[0] == walk.destination[0]
+        && record.reader[1] == walk.destination[1]
+        && record.reader[2] == walk.destination[2]
+}
+
+/// Extends a record, for which [`may_continue`] holds, by the submessage at `offset`. That one must be
+/// a DATA_FRAG with the next fragments of the same sample. `present` and `len` are the available bytes
+/// and all bytes of the datagram. Returns the offset of the submessage after it. Returns 0 and leaves
+/// the record unchanged in all other cases, which [`step`] distinguishes.
+///
+/// The result is that of [`step`] and [`Record::extend`], with fewer instructions.
+#[inline(always)]
+pub fn continue_fragments<B: Bytes>(
+    record: &mut Record,
+    bytes: &B,
+    offset: u32,
+    (present, len): (u32, u32),
+) -> u32 {
+    const FIXED: u32 = 32;
+    let body = offset + 4;
+    if body + FIXED > present {
+        return 0;
+    }
+    let Some(
+        [
+            header,
+            extra,
+            reader,
+            writer,
+            high,
+            low,
+            start,
+            counts,
+            size,
+        ],
+    ) = bytes.words::<9>(offset)
+    else {
+        return 0;
+    };
+    let wire = u32::from_be(header);
+    let flags = u32::from(record.submessage_flags);
+    let order = Order::of(flags);
+    let (_, octets) = order.halves(header);
+    let end = body + octets;
+    let (more, fragment_size) = order.halves(counts);
+    let count = record.fragments_in_submessage();
+    let at = body + EXTRA_LEN + octets_to_inline_qos(order, extra);
+    // A length of zero means "to the end".
+    let continues = wire >> 16 == (kind::DATA_FRAG as u32) << 8 | flags
+        && octets != 0
+        && end <= len
+        && reader == record.reader[3]
+        && writer == record.writer[3]
+        && order.long(high, low) == record.sequence_number
+        && order.word(start) == record.fragment_start.wrapping_add(count)
+        && order.word(start) != 1
+        && fragment_size == record.fragment_size()
+        && order.word(size) == record.sample_size
+        && count + more <= 0xffff
+        && at >= body + FIXED
+        && at <= end;
+    if !continues {
+        return 0;
+    }
+    record.fragments = (count + more) << 16 | fragment_size;
+    record.payload_len = record.payload_len.wrapping_add(end - at);
+    end
+}
+
 /// Handles INFO_TS, INFO_SRC and INFO_DST; skips any other kind by its length.
 #[inline(always)]
 #[expect(

@@ -237,6 +237,77 @@ fn a_data_frag_yields_fragment_numbers_and_sizes() {
     assert_eq!((record.payload_len, header_stamp(&record)), (40, None));
 }
 
+/// Returns a DATA_FRAG with two fragments of 16 bytes from `start` of a sample of 160 bytes.
+fn two_fragments(little: bool, start: u32) -> Vec<u8> {
+    let word = |n: u32| match little {
+        true => n.to_le_bytes(),
+        false => n.to_be_bytes(),
+    };
+    let half = |n: u16| match little {
+        true => n.to_le_bytes(),
+        false => n.to_be_bytes(),
+    };
+    let mut body = [&[0, 0][..], &half(28), &READER, &WRITER].concat();
+    for number in [0, 7, start] {
+        body.extend(word(number));
+    }
+    body.extend([half(2), half(16)].concat());
+    body.extend(word(160));
+    body.extend([0x33; 32]);
+    submessage(0x16, u8::from(little), &body)
+}
+
+#[test]
+fn continued_fragments_extend_a_record_exactly_as_the_walk_does() {
+    for little in [true, false] {
+        let whole = message(&[two_fragments(little, 1), two_fragments(little, 3)]);
+        let (mut continued, mut others) = (0, 0);
+        for at in HEADER_LEN as usize..whole.len() {
+            for value in 0..=u8::MAX {
+                let mut bytes = whole.clone();
+                bytes[at] = value;
+                let mut walk = Walk::default();
+                walk.record.flags = flag::FRAGMENTED;
+                let len = u32::try_from(bytes.len()).unwrap();
+                walk.begin([0; 3], len);
+                let present = u32::try_from(whole.len()).unwrap();
+                if step(&mut walk, &bytes.as_slice(), present) != Step::Endpoint
+                    || !may_continue(&walk, &walk.record)
+                {
+                    continue;
+                }
+                let (mut short, mut long) = (walk.record, walk.record);
+                let bytes = bytes.as_slice();
+                let offset = walk.offset;
+                let next = continue_fragments(&mut short, &bytes, offset, (present, len));
+                let result = step(&mut walk, &bytes, present);
+                let extends = result == Step::Endpoint
+                    && long.writer == walk.record.writer
+                    && long.extend(&walk.record);
+                if next == 0 {
+                    assert_eq!(short, first_record(bytes), "left as it was");
+                    others += 1;
+                } else {
+                    assert!(extends, "byte {at} is {value}: {result:?}");
+                    assert_eq!((next, short), (walk.offset, long), "byte {at} is {value}");
+                    continued += 1;
+                }
+            }
+        }
+        assert!(continued > 5000 && others > 5000, "{continued}, {others}");
+    }
+}
+
+/// Returns the record of the first submessage.
+fn first_record(bytes: &[u8]) -> Record {
+    let mut walk = Walk::default();
+    walk.record.flags = flag::FRAGMENTED;
+    let len = u32::try_from(bytes.len()).unwrap();
+    walk.begin([0; 3], len);
+    step(&mut walk, &bytes, len);
+    walk.record
+}
+
 #[test]
 fn a_length_of_zero_extends_to_the_end_except_for_pad_and_info_ts() {
     let mut last = submessage(0x15, 5, &data_body(true, 1, &[0, 1, 0, 0, 7, 7, 7, 7]));

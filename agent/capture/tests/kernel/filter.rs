@@ -20,6 +20,17 @@ use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 
 use captures::{captures, ip_packets};
 
+/// Runs a test at a packet socket, and at tcx where the kernel has it.
+fn at_interfaces(test: fn(Hook)) {
+    for hook in Hook::at_interfaces() {
+        // A filter keeps its thread on one CPU.
+        let thread = std::thread::spawn(move || test(hook));
+        if let Err(panic) = thread.join() {
+            std::panic::resume_unwind(panic);
+        }
+    }
+}
+
 #[test]
 fn the_host_hook_drops_no_packet() {
     let writer = Guid::new(GuidPrefix(*b"\x01\x0fpasspasspa"), EntityId([0, 0, 1, 3]));
@@ -84,161 +95,173 @@ fn the_verified_host_programs_can_only_return_1() {
 
 #[test]
 fn an_unknown_writer_is_captured_within_its_budget_then_metered_then_counted() {
-    let mut kernel = Kernel::load();
-    let writer = Guid::new(GuidPrefix(*b"\x01\x0fsomebodyxx"), EntityId([0, 0, 1, 3]));
-    let frame = |sn| program_run::data(writer, sn, 1000);
+    at_interfaces(|hook| {
+        let mut kernel = Kernel::load_hook(hook);
+        let writer = Guid::new(GuidPrefix(*b"\x01\x0fsomebodyxx"), EntityId([0, 0, 1, 3]));
+        let frame = |sn| program_run::data(writer, sn, 1000);
 
-    assert!(kernel.frame(&frame(1)).kept, "a budget at first");
-    kernel.set_unknown_budget(2500, 2);
-    let seen: Vec<_> = (2..8).map(|sn| kernel.frame(&frame(sn))).collect();
-    let kept: Vec<_> = seen.iter().map(|seen| seen.kept).collect();
-    assert_eq!(kept, [true, true, true, false, false, false]);
-    let records: Vec<_> = seen.iter().map(|seen| seen.records.len()).collect();
-    assert_eq!(records, [0, 0, 0, 1, 1, 0]);
+        assert!(kernel.frame(&frame(1)).kept, "a budget at first");
+        kernel.set_unknown_budget(2500, 2);
+        let seen: Vec<_> = (2..8).map(|sn| kernel.frame(&frame(sn))).collect();
+        let kept: Vec<_> = seen.iter().map(|seen| seen.kept).collect();
+        assert_eq!(kept, [true, true, true, false, false, false]);
+        let records: Vec<_> = seen.iter().map(|seen| seen.records.len()).collect();
+        assert_eq!(records, [0, 0, 0, 1, 1, 0]);
 
-    kernel.set_interest(&BTreeMap::from([(writer, Verdict::Meter)]));
-    assert_eq!(kernel.frame(&frame(9)).records.len(), 1);
+        kernel.set_interest(&BTreeMap::from([(writer, Verdict::Meter)]));
+        assert_eq!(kernel.frame(&frame(9)).records.len(), 1);
+    });
 }
 
 #[test]
 fn up_to_32_samples_in_a_datagram_become_records_and_more_cause_a_capture() {
-    let writer = Guid::new(GuidPrefix(*b"\x01\x10packspacks"), EntityId([0, 0, 1, 3]));
-    let mut kernel = Kernel::load();
-    kernel.set_interest(&BTreeMap::from([(writer, Verdict::Meter)]));
-    let seen = kernel.frame(&program_run::datagram(&program_run::message(
-        writer,
-        1..=32,
-        20,
-    )));
-    let numbers: Vec<_> = seen
-        .records
-        .iter()
-        .map(|record| record.sequence_number)
-        .collect();
-    assert_eq!(
-        (seen.kept, numbers),
-        (false, (1..=32).collect::<Vec<u64>>())
-    );
-    let seen = kernel.frame(&program_run::datagram(&program_run::message(
-        writer,
-        1..=33,
-        20,
-    )));
-    assert_eq!((seen.kept, seen.records.len()), (true, 0));
+    at_interfaces(|hook| {
+        let writer = Guid::new(GuidPrefix(*b"\x01\x10packspacks"), EntityId([0, 0, 1, 3]));
+        let mut kernel = Kernel::load_hook(hook);
+        kernel.set_interest(&BTreeMap::from([(writer, Verdict::Meter)]));
+        let seen = kernel.frame(&program_run::datagram(&program_run::message(
+            writer,
+            1..=32,
+            20,
+        )));
+        let numbers: Vec<_> = seen
+            .records
+            .iter()
+            .map(|record| record.sequence_number)
+            .collect();
+        assert_eq!(
+            (seen.kept, numbers),
+            (false, (1..=32).collect::<Vec<u64>>())
+        );
+        let seen = kernel.frame(&program_run::datagram(&program_run::message(
+            writer,
+            1..=33,
+            20,
+        )));
+        assert_eq!((seen.kept, seen.records.len()), (true, 0));
+    });
 }
 
 #[test]
 fn a_batch_becomes_the_record_of_the_walk() {
-    let message = include_bytes!("../../../../wire/tests/data/rti-batches.bin");
-    let writer = Guid::new(
-        GuidPrefix([1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12]),
-        EntityId([0, 0, 1, 3]),
-    );
-    let mut kernel = Kernel::load();
-    kernel.set_interest(&BTreeMap::from([(writer, Verdict::Meter)]));
-    let seen = kernel.frame(&program_run::datagram(message));
-    let mut walked = Vec::new();
-    walk::datagram(message, &Envelope::default(), None, |found| {
-        walked.push(found.record);
-    });
-    let fields = |record: &Record| {
-        (
-            record.kind,
-            record.writer,
-            record.sequence_number,
+    at_interfaces(|hook| {
+        let message = include_bytes!("../../../../wire/tests/data/rti-batches.bin");
+        let writer = Guid::new(
+            GuidPrefix([1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12]),
+            EntityId([0, 0, 1, 3]),
+        );
+        let mut kernel = Kernel::load_hook(hook);
+        kernel.set_interest(&BTreeMap::from([(writer, Verdict::Meter)]));
+        let seen = kernel.frame(&program_run::datagram(message));
+        let mut walked = Vec::new();
+        walk::datagram(message, &Envelope::default(), None, |found| {
+            walked.push(found.record);
+        });
+        let fields = |record: &Record| {
             (
-                record.fragment_start,
-                record.sample_size,
-                record.payload_len,
-            ),
-            record.flags & flag::INLINE_QOS_UNREAD,
-        )
-    };
-    assert_eq!(
-        seen.records.iter().map(fields).collect::<Vec<_>>(),
-        walked.iter().map(fields).collect::<Vec<_>>()
-    );
-    assert_eq!((seen.kept, walked.len()), (false, 3));
+                record.kind,
+                record.writer,
+                record.sequence_number,
+                (
+                    record.fragment_start,
+                    record.sample_size,
+                    record.payload_len,
+                ),
+                record.flags & flag::INLINE_QOS_UNREAD,
+            )
+        };
+        assert_eq!(
+            seen.records.iter().map(fields).collect::<Vec<_>>(),
+            walked.iter().map(fields).collect::<Vec<_>>()
+        );
+        assert_eq!((seen.kept, walked.len()), (false, 3));
+    });
 }
 
 #[test]
 fn any_number_of_consecutive_fragments_in_a_datagram_is_one_record() {
-    let writer = Guid::new(GuidPrefix(*b"\x01\x10manyfrags "), EntityId([0, 0, 1, 3]));
-    let reports = |kernel: &mut Kernel, number, starts: Vec<u32>, of| {
-        let seen = kernel.frame(&program_run::data_frags(writer, number, starts, of, 16));
-        assert!(!seen.kept);
-        let records = [seen.records, kernel.take_stalled()].concat();
-        let reports = records.into_iter().map(|record| {
-            let count = record.fragments_in_submessage();
-            (record.sequence_number, record.fragment_start, count)
-        });
-        reports.collect::<Vec<_>>()
-    };
-    let mut kernel = Kernel::load();
-    kernel.set_interest(&BTreeMap::from([(writer, Verdict::Meter)]));
-    // These are more fragments than a datagram has records.
-    let all: Vec<u32> = (1..=40).collect();
-    assert_eq!(reports(&mut kernel, 1, all.clone(), 40), [(1, 1, 40)]);
-    let later: Vec<u32> = (1..=5).chain(7..=12).collect();
-    let holes = reports(&mut kernel, 2, later, 40);
-    assert_eq!(holes, [(2, 1, 5), (2, 7, 6)]);
-    let back = reports(&mut kernel, 3, vec![9, 10, 3, 4, 4], 40);
-    assert_eq!(back, [(3, 9, 2), (3, 3, 2), (3, 4, 1)]);
+    at_interfaces(|hook| {
+        let writer = Guid::new(GuidPrefix(*b"\x01\x10manyfrags "), EntityId([0, 0, 1, 3]));
+        let reports = |kernel: &mut Kernel, number, starts: Vec<u32>, of| {
+            let seen = kernel.frame(&program_run::data_frags(writer, number, starts, of, 16));
+            assert!(!seen.kept);
+            let records = [seen.records, kernel.take_stalled()].concat();
+            let reports = records.into_iter().map(|record| {
+                let count = record.fragments_in_submessage();
+                (record.sequence_number, record.fragment_start, count)
+            });
+            reports.collect::<Vec<_>>()
+        };
+        let mut kernel = Kernel::load_hook(hook);
+        kernel.set_interest(&BTreeMap::from([(writer, Verdict::Meter)]));
+        // These are more fragments than a datagram has records.
+        let all: Vec<u32> = (1..=40).collect();
+        assert_eq!(reports(&mut kernel, 1, all.clone(), 40), [(1, 1, 40)]);
+        let later: Vec<u32> = (1..=5).chain(7..=12).collect();
+        let holes = reports(&mut kernel, 2, later, 40);
+        assert_eq!(holes, [(2, 1, 5), (2, 7, 6)]);
+        let back = reports(&mut kernel, 3, vec![9, 10, 3, 4, 4], 40);
+        assert_eq!(back, [(3, 9, 2), (3, 3, 2), (3, 4, 1)]);
 
-    // Each submessage of an unknown writer is charged to the budget.
-    kernel.forget_interest(&BTreeMap::from([(writer, Verdict::Meter)]));
-    kernel.set_unknown_budget(0, 3);
-    let before = kernel.counter(Counter::MeteredUnknown);
-    let charged = reports(&mut kernel, 4, all, 40);
-    assert_eq!(charged, [(4, 1, 3)]);
-    assert_eq!(kernel.counter(Counter::MeteredUnknown) - before, 3);
+        // Each submessage of an unknown writer is charged to the budget.
+        kernel.forget_interest(&BTreeMap::from([(writer, Verdict::Meter)]));
+        kernel.set_unknown_budget(0, 3);
+        let before = kernel.counter(Counter::MeteredUnknown);
+        let charged = reports(&mut kernel, 4, all, 40);
+        assert_eq!(charged, [(4, 1, 3)]);
+        assert_eq!(kernel.counter(Counter::MeteredUnknown) - before, 3);
+    });
 }
 
 #[test]
 fn an_acknack_is_metered_if_its_reader_is_metered() {
-    let reader = Guid::new(GuidPrefix(*b"\x01\x0freaderread"), EntityId([0, 0, 7, 4]));
-    let mut payload = b"RTPS\x02\x03\x01\x0f".to_vec();
-    payload.extend_from_slice(&reader.prefix.0);
-    payload.extend_from_slice(&[0x06, 1, 24, 0]);
-    payload.extend_from_slice(&[reader.entity.0, [0, 0, 1, 3]].concat());
-    payload.extend_from_slice(&[0, 0, 0, 0, 5, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0]);
-    let mut kernel = Kernel::load();
-    kernel.set_unknown_budget(10_000, 10);
-    assert!(
-        kernel
-            .frame(&program_run::datagram(&payload))
-            .records
-            .is_empty()
-    );
-    kernel.set_interest(&BTreeMap::from([(reader, Verdict::Meter)]));
-    let seen = kernel.frame(&program_run::datagram(&payload));
-    assert_eq!(seen.records.len(), 1);
-    assert_eq!(
-        (seen.records[0].reader(), seen.records[0].sequence_number),
-        (reader, 5)
-    );
+    at_interfaces(|hook| {
+        let reader = Guid::new(GuidPrefix(*b"\x01\x0freaderread"), EntityId([0, 0, 7, 4]));
+        let mut payload = b"RTPS\x02\x03\x01\x0f".to_vec();
+        payload.extend_from_slice(&reader.prefix.0);
+        payload.extend_from_slice(&[0x06, 1, 24, 0]);
+        payload.extend_from_slice(&[reader.entity.0, [0, 0, 1, 3]].concat());
+        payload.extend_from_slice(&[0, 0, 0, 0, 5, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0]);
+        let mut kernel = Kernel::load_hook(hook);
+        kernel.set_unknown_budget(10_000, 10);
+        assert!(
+            kernel
+                .frame(&program_run::datagram(&payload))
+                .records
+                .is_empty()
+        );
+        kernel.set_interest(&BTreeMap::from([(reader, Verdict::Meter)]));
+        let seen = kernel.frame(&program_run::datagram(&payload));
+        assert_eq!(seen.records.len(), 1);
+        assert_eq!(
+            (seen.records[0].reader(), seen.records[0].sequence_number),
+            (reader, 5)
+        );
+    });
 }
 
 #[test]
 fn foreign_and_damaged_frames_are_never_kept() {
-    let mut kernel = Kernel::load();
-    kernel.set_unknown_budget(1 << 20, 100);
-    let writer = Guid::new(GuidPrefix(*b"\x01\x0fdamageddam"), EntityId([0, 0, 1, 3]));
-    let whole = program_run::data(writer, 1, 100);
-    assert!(kernel.frame(&whole).kept);
-    for len in 20..whole.len() {
-        kernel.frame(&whole[..len]);
-    }
-    for at in 0..whole.len() {
-        let mut damaged = whole.clone();
-        damaged[at] ^= 0xff;
-        kernel.frame(&damaged);
-    }
-    assert!(
-        !kernel
-            .frame(&program_run::datagram(b"not RTPS at all, but long enough"))
-            .kept
-    );
+    at_interfaces(|hook| {
+        let mut kernel = Kernel::load_hook(hook);
+        kernel.set_unknown_budget(1 << 20, 100);
+        let writer = Guid::new(GuidPrefix(*b"\x01\x0fdamageddam"), EntityId([0, 0, 1, 3]));
+        let whole = program_run::data(writer, 1, 100);
+        assert!(kernel.frame(&whole).kept);
+        for len in 20..whole.len() {
+            kernel.frame(&whole[..len]);
+        }
+        for at in 0..whole.len() {
+            let mut damaged = whole.clone();
+            damaged[at] ^= 0xff;
+            kernel.frame(&damaged);
+        }
+        assert!(
+            !kernel
+                .frame(&program_run::datagram(b"not RTPS at all, but long enough"))
+                .kept
+        );
+    });
 }
 
 #[test]

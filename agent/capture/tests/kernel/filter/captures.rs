@@ -183,9 +183,9 @@ fn comparable(record: Record) -> Record {
     }
 }
 
-fn compare(path: &Path, interest: &BTreeMap<Guid, Verdict>) -> (usize, usize) {
+fn compare(path: &Path, hook: Hook, interest: &BTreeMap<Guid, Verdict>) -> (usize, usize) {
     let packets = ip_packets(path);
-    let mut kernel = Kernel::load();
+    let mut kernel = Kernel::load_hook(hook);
     kernel.set_interest(interest);
     let (mut user, mut records, mut captures) = (user_space(), 0, 0);
     let mut runs = Runs::default();
@@ -200,6 +200,7 @@ fn compare(path: &Path, interest: &BTreeMap<Guid, Verdict>) -> (usize, usize) {
         user.packet(packet, |payload, envelope| {
             let (capture, records) = expected(payload, envelope, interest);
             captured = capture;
+            let records = joined(records);
             let joins = records.len() == 1 || !envelope.fragmented;
             records
                 .into_iter()
@@ -221,6 +222,21 @@ fn compare(path: &Path, interest: &BTreeMap<Guid, Verdict>) -> (usize, usize) {
     wanted.sort_by_key(|record| (record.writer, record.destination, record.sequence_number));
     assert_eq!(stalled, wanted, "{}: runs left over", path.display());
     (records + stalled.len(), captures)
+}
+
+/// Joins consecutive DATA_FRAGs of a datagram.
+fn joined(records: Vec<Record>) -> Vec<Record> {
+    let mut joined: Vec<Record> = Vec::new();
+    for record in records {
+        let last = joined.last_mut().filter(|last| {
+            (last.kind, record.kind) == (kind::DATA_FRAG, kind::DATA_FRAG)
+                && last.writer == record.writer
+        });
+        if !last.is_some_and(|last| last.extend(&record)) {
+            joined.push(record);
+        }
+    }
+    joined
 }
 
 /// Joins consecutive fragments as the filter does: by stream, on one CPU.
@@ -257,9 +273,12 @@ fn the_kernel_and_user_space_make_the_same_records_of_every_capture() {
     for path in captures() {
         let all = endpoints(&ip_packets(&path));
         let meter_all = all.iter().map(|guid| (*guid, Verdict::Meter)).collect();
-        let (records, captured) = compare(&path, &meter_all);
-        assert!(captured > 0, "{}: no discovery seen", path.display());
-        println!("{}: {records} records, {captured} captured", path.display());
+        for hook in by_receivers() {
+            let (records, captured) = compare(&path, hook, &meter_all);
+            assert!(captured > 0, "{}: no discovery seen", path.display());
+            let path = path.display();
+            println!("{path}, {hook:?}: {records} records, {captured} captured");
+        }
 
         let verdicts = [Verdict::Ignore, Verdict::Meter, Verdict::Capture];
         let mixed = all
@@ -267,8 +286,17 @@ fn the_kernel_and_user_space_make_the_same_records_of_every_capture() {
             .copied()
             .zip(verdicts.into_iter().cycle())
             .collect();
-        compare(&path, &mixed);
+        for hook in by_receivers() {
+            compare(&path, hook, &mixed);
+        }
     }
+}
+
+/// Returns the hooks at interfaces that see received packets.
+fn by_receivers() -> Vec<Hook> {
+    let mut hooks = Hook::at_interfaces();
+    hooks.retain(|hook| *hook != Hook::TcxEgress);
+    hooks
 }
 
 /// A datagram as sockets see it: one IP packet, however many fragments it was cut into.
