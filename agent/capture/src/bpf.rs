@@ -12,6 +12,7 @@ use ros2probe_attach::kernel::TRACE_UPROBE_MULTI;
 const MAP_LOOKUP_ELEM: c_int = 1;
 const MAP_UPDATE_ELEM: c_int = 2;
 const PROG_LOAD: c_int = 5;
+const PROG_QUERY: c_int = 16;
 const RAW_TRACEPOINT_OPEN: c_int = 17;
 const BTF_LOAD: c_int = 18;
 const LINK_CREATE: c_int = 28;
@@ -147,6 +148,60 @@ pub(crate) fn create_link(program: u32, target: u32, attach_type: u32) -> io::Re
     unsafe { descriptor(LINK_CREATE, &[program, target, attach_type, 0]) }
 }
 
+/// Links a program to an interface of the calling thread's network namespace, in front of the
+/// programs that it has. Closing the descriptor removes the link.
+///
+/// # Errors
+/// Fails if the kernel refuses the link, or if the interface is gone (`ENODEV`).
+pub(crate) fn create_first_link(
+    program: BorrowedFd<'_>,
+    interface: u32,
+    attach_type: u32,
+) -> io::Result<OwnedFd> {
+    /// `BPF_F_BEFORE`; without another program, the position is the first one.
+    const BEFORE: u32 = 1 << 3;
+    // SAFETY: the attributes contain no pointer.
+    unsafe {
+        descriptor(
+            LINK_CREATE,
+            &[number(program), interface, attach_type, BEFORE],
+        )
+    }
+}
+
+/// Returns the number of programs that an interface of the calling thread's network namespace has
+/// for an attach type.
+///
+/// # Errors
+/// Fails if the kernel does not know the attach type (`EINVAL`), or without CAP_NET_ADMIN.
+pub fn count_programs(interface: u32, attach_type: u32) -> io::Result<u32> {
+    /// Attributes of `BPF_PROG_QUERY`.
+    #[repr(C)]
+    #[derive(Default)]
+    struct Query {
+        target: u32,
+        attach_type: u32,
+        query_flags: u32,
+        attach_flags: u32,
+        programs: u64,
+        count: u32,
+        unused: u32,
+        program_flags: u64,
+        links: u64,
+        link_flags: u64,
+        revision: u64,
+    }
+    let mut query = Query {
+        target: interface,
+        attach_type,
+        ..Query::default()
+    };
+    // SAFETY: the kernel writes only to the attributes, because every pointer in them is null. They
+    // outlive the call, and are passed with their size.
+    unsafe { call_mut(PROG_QUERY, &mut query) }?;
+    Ok(query.count)
+}
+
 /// Runs a program at a tracepoint, such as `sched_switch`. Closing the descriptor ends it.
 ///
 /// # Errors
@@ -200,6 +255,20 @@ unsafe fn descriptor<T>(command: c_int, attributes: &T) -> io::Result<OwnedFd> {
     let descriptor = unsafe { call(command, attributes) }?;
     // SAFETY: the command returns a new descriptor, which nothing else owns.
     Ok(unsafe { OwnedFd::from_raw_fd(descriptor) })
+}
+
+/// Calls a command that also writes to its attributes.
+///
+/// # Safety
+/// The conditions are those of [`call`].
+unsafe fn call_mut<T>(command: c_int, attributes: &mut T) -> io::Result<c_int> {
+    // SAFETY: as in `call`.
+    let result =
+        unsafe { libc::syscall(libc::SYS_bpf, command, &raw mut *attributes, size_of::<T>()) };
+    match c_int::try_from(result) {
+        Ok(result @ 0..) => Ok(result),
+        _ => Err(io::Error::last_os_error()),
+    }
 }
 
 /// Calls a command with its attributes. The kernel treats attributes beyond the passed size as

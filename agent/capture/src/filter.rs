@@ -148,14 +148,16 @@ impl Default for FilterSettings {
 
 /// One loaded filter with its maps: of the wire hook, of the host hook, or of the uprobe.
 pub struct Filter {
-    /// Entry of the wire hook, the host hook's program for received datagrams, or the uprobe's
-    /// first program.
+    /// Entry of the wire hook, the host hook's program for received datagrams, tcx' program for
+    /// received packets, or the uprobe's first program.
     program: OwnedFd,
+    /// tcx' program for sent packets.
+    tcx_egress: Option<ProgramFd>,
     /// The wire hook's program, which its entry tail-calls; the kernel empties the array when it is
     /// closed.
     _wire: Option<ProgramArray<MapData>>,
     host: Option<host_hook::HostHook>,
-    /// Ring of captured datagrams; `None` for the wire hook.
+    /// Ring of captured datagrams, or of captured packets at tcx; `None` for the wire hook.
     pieces: Option<RingBuf<MapData>>,
     interest: HashMap<MapData, [u32; 4], u32>,
     participants: HashMap<MapData, [u32; 3], u64>,
@@ -177,7 +179,7 @@ impl Filter {
     pub fn load(settings: &FilterSettings) -> Result<Self, FilterError> {
         let mut sizes = vec![("PIECES", page_size()), ("SOCKETS", UNUSED_MAP_ENTRIES)];
         sizes.extend(NO_DELIVERIES);
-        let mut ebpf = open(settings, false, &sizes, None, 0)?;
+        let mut ebpf = open(settings, Reads::WithHelper, &sizes, None, 0)?;
         let program = load_program(&mut ebpf, "wire")?;
         let mut wire: ProgramArray<_> = take(&mut ebpf, "WIRE")?;
         wire.set(0, &program, 0).map_err(failed("WIRE", "set"))?;
@@ -185,6 +187,26 @@ impl Filter {
         let filter = Self::with_maps(&mut ebpf, entry.as_fd(), None)?;
         Ok(Self {
             _wire: Some(wire),
+            ..filter
+        })
+    }
+
+    /// Loads the programs for tcx and their maps, without attaching them.
+    ///
+    /// # Errors
+    /// Fails as [`Self::load`] does, and without CAP_NET_ADMIN.
+    pub fn load_tcx(settings: &FilterSettings) -> Result<Self, FilterError> {
+        let pieces = ring_size(settings.piece_ring_bytes);
+        let mut sizes = vec![("PIECES", pieces), ("SOCKETS", UNUSED_MAP_ENTRIES)];
+        sizes.extend(NO_DELIVERIES);
+        let mut ebpf = open(settings, Reads::InPlace, &sizes, None, 0)?;
+        let ingress = load_program(&mut ebpf, "tcx_ingress")?;
+        let egress = load_program(&mut ebpf, "tcx_egress")?;
+        let pieces = take(&mut ebpf, "PIECES")?;
+        let filter = Self::with_maps(&mut ebpf, ingress.as_fd(), None)?;
+        Ok(Self {
+            tcx_egress: Some(egress),
+            pieces: Some(pieces),
             ..filter
         })
     }
@@ -208,6 +230,7 @@ impl Filter {
         let program = program.try_clone_to_owned();
         Ok(Self {
             program: program.map_err(FilterError::Attach)?,
+            tcx_egress: None,
             _wire: None,
             host,
             pieces: None,
@@ -225,6 +248,13 @@ impl Filter {
     #[must_use]
     pub fn program(&self) -> BorrowedFd<'_> {
         self.program.as_fd()
+    }
+
+    /// Returns the programs for received and sent packets at tcx; `None` on other hooks.
+    #[must_use]
+    pub fn tcx_programs(&self) -> Option<[BorrowedFd<'_>; 2]> {
+        let egress = self.tcx_egress.as_ref()?;
+        Some([self.program(), egress.as_fd()])
     }
 
     /// Returns a descriptor that is readable when the record ring is half full.
@@ -442,17 +472,26 @@ const NO_DELIVERIES: [(&str, u32); 4] = [
     ("SENT", UNUSED_MAP_ENTRIES),
 ];
 
-/// Opens the object and creates its maps with the given `sizes`. `host` selects the host hook.
-/// `layout` is for programs that read the kernel's structures. `within` is the control group of the
+/// How programs read packets.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Reads {
+    /// In place where a packet is contiguous: programs at a cgroup and at tcx.
+    InPlace,
+    /// By calls of a helper only: programs of packet sockets.
+    WithHelper,
+}
+
+/// Opens the object and creates its maps with the given `sizes`. `reads` selects the kind of
+/// programs. `layout` is for programs that read the kernel's structures. `within` is the control group of the
 /// processes whose shared-memory messages are read; 0 = all.
 fn open(
     settings: &FilterSettings,
-    host: bool,
+    reads: Reads,
     sizes: &[(&'static str, u32)],
     layout: Option<&KernelLayout>,
     within: u64,
 ) -> Result<Ebpf, FilterError> {
-    let in_place = u32::from(host);
+    let in_place = u32::from(reads == Reads::InPlace);
     let preempted = u32::from(preempts_everything());
     let tail_calls = permits_tail_calls();
     let ring = ring_size(settings.record_ring_bytes);
@@ -489,6 +528,7 @@ fn load_program(ebpf: &mut Ebpf, name: &'static str) -> Result<ProgramFd, Filter
     match program {
         Program::SocketFilter(program) => program.load(),
         Program::CgroupSkb(program) => program.load(),
+        Program::SchedClassifier(program) => program.load(),
         _ => return Err(FilterError::Missing(name)),
     }
     .map_err(FilterError::program)?;

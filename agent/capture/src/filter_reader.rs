@@ -32,7 +32,7 @@ pub const SETTLE_NANOSECONDS: u64 = 50_000_000;
 /// Fragments of one sample follow each other within microseconds; a longer pause ends the run.
 const STALLED_NANOSECONDS: u64 = 30_000_000;
 /// Datagrams younger than this wait for older records that may still be in the ring.
-const FRESH_NANOSECONDS: u64 = 2_000_000;
+pub(crate) const FRESH_NANOSECONDS: u64 = 2_000_000;
 /// Maximum number of pieces read per round.
 const PIECES_PER_ROUND: usize = 32_768;
 /// The ring is emptied again after this many records passed to the model: a burst fills it while

@@ -58,6 +58,7 @@ pub mod sockets;
 pub mod streams;
 pub mod system;
 pub mod tables;
+pub mod tcx;
 pub mod threads;
 pub mod tracepoints;
 pub mod uprobe;

@@ -41,7 +41,7 @@ use super::wire_tap::{self, WireTap, WireTapError};
 use crate::inside::late::LateDemand;
 use crate::inside::{Facts as InsideFacts, Inside};
 use crate::reassembly::Limits;
-use crate::settings::{CaptureSettings, ShmMode};
+use crate::settings::{CaptureSettings, ShmMode, WireChoice};
 use open::{open_exact, open_host, open_inside, open_wires, scope};
 use ros2probe_model::observe::input::Input;
 use ros2probe_model::observe::observer::{Observer, Wanted};
@@ -296,6 +296,12 @@ impl LiveSource {
             let reason = in_words(&error);
             tracing::warn!(reason, "a recreated cgroup is not observed");
         }
+        for wire in &mut self.wires {
+            if let Err(error) = wire.start(spawn) {
+                let reason = in_words(&error);
+                tracing::warn!(reason, "interfaces that appear later are not observed");
+            }
+        }
         if let Some(inside) = &mut self.inside
             && let Err(error) = inside.start(spawn)
         {
@@ -344,6 +350,19 @@ impl LiveSource {
         !self.wires.is_empty()
     }
 
+    /// Returns how interfaces are observed, which is the same in all namespaces; `None` if none are.
+    #[must_use]
+    pub fn wire_hook(&self) -> Option<WireChoice> {
+        self.wires.first().map(WireTap::hook)
+    }
+
+    /// Returns why tcx is not used on interfaces, as a sentence; `None` if it is used, or not
+    /// configured.
+    #[must_use]
+    pub fn without_tcx(&self) -> Option<&str> {
+        self.wires.iter().find_map(WireTap::without_tcx)
+    }
+
     /// Returns why the host hook is not used although it would show more, as a sentence; `None` if
     /// it is used, or not configured.
     #[must_use]
@@ -383,7 +402,11 @@ impl LiveSource {
         };
         let ready = wait(&descriptors, timeout).map_err(CaptureError::Wait)?;
         let woken = ready.is_some_and(|first| first >= rings) && began.elapsed() < timeout;
-        if (self.host.is_some() || self.exact.is_some()) && woken {
+        // A packet socket collects frames by itself.
+        let wakes_soon = self.host.is_some()
+            || self.exact.is_some()
+            || self.wire_hook() == Some(WireChoice::Tcx);
+        if wakes_soon && woken {
             // Packets arrive in bursts. After a timeout, packets have already had time to
             // accumulate.
             std::thread::sleep(if observer.needs_payloads() {

@@ -10,6 +10,8 @@ use serde::Deserialize;
 pub struct CaptureSettings {
     /// Whether packets are captured at the sockets of this host or on interfaces.
     pub source: SourceChoice,
+    /// How interfaces are observed.
+    pub wire: WireChoice,
     /// Cgroup whose sockets are observed; `None` = the whole host.
     pub cgroup: Option<PathBuf>,
     /// Globs of interfaces that are observed in addition to the host's sockets.
@@ -115,6 +117,31 @@ pub enum SourceChoice {
     Host,
     /// Frames on the interfaces.
     Wire,
+}
+
+/// How the agent reads frames on interfaces.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum WireChoice {
+    /// `tcx` if the kernel and the privileges allow it, otherwise `packet`.
+    #[default]
+    Auto,
+    /// Programs at the interfaces, which the kernel has from Linux 6.6 on.
+    Tcx,
+    /// A packet socket.
+    Packet,
+}
+
+impl WireChoice {
+    /// Returns the name of the choice in the configuration file.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Auto => "auto",
+            Self::Tcx => "tcx",
+            Self::Packet => "packet",
+        }
+    }
 }
 
 impl SourceChoice {

@@ -17,6 +17,8 @@ pub enum Task {
     SharedMemory,
     /// Attaches the host hook to a recreated control group.
     Reattach,
+    /// Attaches programs to interfaces that appear.
+    Tcx,
     /// Attaches uprobes to libraries.
     Probes,
     /// Attaches uprobes inside processes, and reads their tables.

@@ -1,8 +1,11 @@
-//! One network namespace observed on its interfaces: packet socket, ring, kernel filter, and the
-//! path of their output to the model.
+//! One network namespace observed on its interfaces: kernel filter, hook and ring, and the path of
+//! their output to the model.
 //!
+//! The filter runs at tcx ([`super::tcx`]) where the kernel has it, otherwise at a packet socket.
 //! Frames and records arrive through two rings, either of which may be faster; both are merged by
 //! time. The tap sends nothing.
+
+mod hook;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -10,7 +13,6 @@ use std::io;
 use std::os::fd::{AsFd as _, BorrowedFd};
 use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
 use ros2probe_wire::frame::{self, PacketType, Payload};
 use ros2probe_wire::record::Body;
@@ -18,15 +20,19 @@ use ros2probe_wire::walk::Envelope;
 use ros2probe_wire::{Reason, Record, Timestamp, WireError};
 
 use super::border::observe;
-use super::filter::{Filter, FilterError, FilterSettings, ports};
+use super::filter::{Filter, FilterError};
 use super::interfaces::{Change, Interface, Interfaces, InterfacesError, Selection};
 use super::reattach::{Identity, identity};
 use super::reorder_buffer::{Next, ReorderBuffer, Segment as Waiting};
-use super::ring::{self, Ring, RingError, RingFrame};
+use super::ring::{RingError, RingFrame};
 use super::streams::{Chunk, Streams, flow, flow_of};
 use super::system::Clocks;
+use super::tcx::{FollowError, TcxError};
 use crate::ahead::{Ahead, ReadyItem};
 use crate::reassembly::{FlowKey, Limits, Reassembled, Reassembly};
+use crate::settings::WireChoice;
+use crate::threads::Spawn;
+use hook::{Hook, Taken};
 use ros2probe_model::graph::zenoh::StreamId;
 use ros2probe_model::observe::input::Input;
 use ros2probe_model::observe::observer::Observer;
@@ -43,6 +49,9 @@ pub enum WireTapError {
     /// The kernel filter failed.
     #[error(transparent)]
     Filter(#[from] FilterError),
+    /// Programs at the interfaces are required but unavailable.
+    #[error("the configuration requires tcx (capture.wire)")]
+    Tcx(#[from] TcxError),
     /// The packet socket or its ring failed.
     #[error(transparent)]
     Ring(#[from] RingError),
@@ -54,6 +63,8 @@ pub enum WireTapError {
 /// The observed interfaces of a namespace, and the memory for them.
 #[derive(Clone, Debug)]
 pub struct WireTapSettings {
+    /// How the interfaces are observed.
+    pub wire: WireChoice,
     /// The observed interfaces.
     pub selection: Selection,
     /// Bytes of the packet ring.
@@ -74,7 +85,7 @@ pub struct WireTap {
     identity: Option<Identity>,
     /// Whether the path is gone or names another namespace.
     is_gone: bool,
-    ring: Ring,
+    hook: Hook,
     filter: Filter,
     interfaces: Interfaces,
     selection: Selection,
@@ -87,8 +98,8 @@ pub struct WireTap {
 
 impl WireTap {
     /// Opens a tap in the calling thread's namespace, which is the one at `path` or, without a
-    /// path, the agent's own. `number` distinguishes the taps. The filter's interface map is set
-    /// before the socket sees the first frame.
+    /// path, the agent's own. `number` distinguishes the taps. Excluded interfaces are not read at any
+    /// time.
     ///
     /// # Errors
     /// Fails if a capability is missing, or if the kernel refuses the socket, ring or filter.
@@ -98,27 +109,15 @@ impl WireTap {
         path: Option<PathBuf>,
     ) -> Result<Self, WireTapError> {
         let selection = settings.selection.clone();
-        let mut filter = Filter::load(&FilterSettings {
-            record_ring_bytes: u32::try_from(settings.record_ring_bytes).unwrap_or(u32::MAX >> 1),
-            accept_new_interfaces: selection.accepts_unknown(),
-            zenoh_ports: ports(&settings.zenoh_ports),
-            ..FilterSettings::default()
-        })?;
         let interfaces = Interfaces::open()?;
-        for interface in interfaces.iter() {
-            filter.accept_interface(interface.index, selection.accepts(&interface.name))?;
-        }
         let mut included = IncludedInterfaces::default();
         included.update(&selection, &interfaces);
-        let ring = Ring::open(
-            ring::Settings::with_memory(settings.ring_bytes),
-            Some(filter.program()),
-        )?;
+        let (filter, hook) = hook::open(settings, &interfaces)?;
         Ok(Self {
             identity: path.as_deref().and_then(identity),
             is_gone: false,
             path,
-            ring,
+            hook,
             filter,
             interfaces,
             selection,
@@ -134,6 +133,26 @@ impl WireTap {
             refused_interfaces: 0,
             included,
         })
+    }
+
+    /// Starts the thread that attaches the filter to interfaces that appear later, if it is needed.
+    ///
+    /// # Errors
+    /// Fails if the thread cannot be started.
+    pub fn start(&mut self, spawn: Spawn) -> Result<(), FollowError> {
+        self.hook.start(self.path.as_deref(), spawn)
+    }
+
+    /// Returns how the interfaces are observed; never [`WireChoice::Auto`].
+    #[must_use]
+    pub const fn hook(&self) -> WireChoice {
+        self.hook.kind()
+    }
+
+    /// Returns why tcx is not used, as a sentence; `None` if it is used, or not configured.
+    #[must_use]
+    pub fn without_tcx(&self) -> Option<&str> {
+        self.hook.without_tcx()
     }
 
     /// Returns the network namespace as configured; `None` = the agent's own.
@@ -196,13 +215,10 @@ impl WireTap {
     }
 
     /// Returns descriptors that are readable when frames, records or interface changes wait.
-    #[must_use]
-    pub fn descriptors(&self) -> [BorrowedFd<'_>; 3] {
-        [
-            self.ring.as_fd(),
-            self.filter.record_ring(),
-            self.interfaces.as_fd(),
-        ]
+    pub fn descriptors(&self) -> impl Iterator<Item = BorrowedFd<'_>> {
+        let ring = self.hook.descriptor().or_else(|| self.filter.piece_ring());
+        ring.into_iter()
+            .chain([self.filter.record_ring(), self.interfaces.as_fd()])
     }
 
     /// Reads everything available, and passes everything older than [`SETTLE_NANOSECONDS`] to the
@@ -263,7 +279,7 @@ impl WireTap {
     /// # Errors
     /// Fails if the kernel's statistics cannot be read.
     pub fn drops(&mut self) -> Result<u64, WireTapError> {
-        Ok(self.ring.statistics()?.drops)
+        self.hook.drops(&self.filter)
     }
 
     /// Returns the bytes read from the kernel: frames and records.
@@ -277,7 +293,8 @@ impl WireTap {
     #[must_use]
     pub const fn incomplete_datagrams(&self) -> u64 {
         let reassembly = self.frames.reassembly.counters();
-        self.frames.ahead.discarded() + reassembly.evicted + reassembly.timed_out
+        let waiting = self.frames.ahead.discarded() + self.hook.incomplete_frames();
+        waiting + reassembly.evicted + reassembly.timed_out
     }
 
     /// Returns the bytes held for reassembly.
@@ -298,10 +315,11 @@ impl WireTap {
         &self.frames.streams
     }
 
-    /// Returns the number of interfaces that did not fit the kernel filter's map.
+    /// Returns the number of interfaces that did not fit the kernel filter's map, or to which the filter
+    /// could not be attached.
     #[must_use]
-    pub const fn refused_interfaces(&self) -> u64 {
-        self.refused_interfaces
+    pub fn refused_interfaces(&self) -> u64 {
+        self.refused_interfaces + self.hook.refused_interfaces()
     }
 
     /// Applies changes of interfaces. A failed listing is repeated at the next call. A removed
@@ -315,13 +333,13 @@ impl WireTap {
             let result = match change {
                 Change::Present(Interface { index, name, .. }) => {
                     let accept = self.selection.accepts(&name);
-                    self.filter.accept_interface(index, accept)
+                    self.hook.accept(&mut self.filter, index, accept)
                 }
                 Change::Gone(Interface { index, .. }) => {
                     let interfaces = &self.interfaces;
                     self.packets
                         .retain(|index, _| interfaces.by_index(*index).is_some());
-                    self.filter.forget_interface(index)
+                    self.hook.forget(&mut self.filter, index)
                 }
             };
             self.refused_interfaces += u64::from(result.is_err());
@@ -337,33 +355,25 @@ impl WireTap {
         at_sockets: Option<&Streams>,
         observer: &mut Observer,
     ) -> Result<(), WireTapError> {
-        // Clears the error that the socket reports when a link goes down; otherwise every wait
-        // would return immediately.
-        self.ring.wait(Duration::ZERO)?;
-        // At most one full ring is read, so that a flood does not starve other work.
-        for _ in 0..self.ring.blocks() {
-            let Some(block) = self.ring.block() else {
-                break;
-            };
-            self.frames.take_records(&mut self.filter);
-            let mut frames = block.frames();
-            for captured in frames.by_ref() {
+        let (filter, assembly) = (&mut self.filter, &mut self.frames);
+        let failed = |reason, observer: &mut Observer| {
+            observer.input(Input::DecodeError {
+                stage: "frame",
+                reason,
+            });
+        };
+        self.hook.take_frames(filter, clocks, |taken| match taken {
+            Taken::Begin(filter) => {
+                assembly.take_records(filter);
+            }
+            Taken::Frame(captured) => {
                 *self.packets.entry(captured.interface).or_default() += 1;
-                if let Err(error) = self.frames.frame(clocks, &captured, at_sockets, observer) {
-                    observer.input(Input::DecodeError {
-                        stage: "frame",
-                        reason: error.reason,
-                    });
+                if let Err(error) = assembly.frame(clocks, captured, at_sockets, observer) {
+                    failed(error.reason, observer);
                 }
             }
-            if frames.damaged() {
-                observer.input(Input::DecodeError {
-                    stage: "frame",
-                    reason: Reason::BadLength,
-                });
-            }
-        }
-        Ok(())
+            Taken::Damaged => failed(Reason::BadLength, observer),
+        })
     }
 }
 

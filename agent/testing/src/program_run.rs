@@ -9,14 +9,17 @@ use std::time::Duration;
 use ros2probe_capture::ahead::{Ahead, ReadyItem};
 use ros2probe_capture::filter::{Filter, FilterSettings};
 use ros2probe_capture::reassembly::{FlowKey, Limits, Reassembly};
+use ros2probe_capture::tcx::{self, TcxError};
 use ros2probe_wire::filter::{Budget, Counter};
 use ros2probe_wire::frame::{self, PacketType, Payload};
 use ros2probe_wire::host::Piece;
-use ros2probe_wire::record::{Record, Verdict, kind};
+use ros2probe_wire::record::{Record, Verdict, flag, kind};
 use ros2probe_wire::time::RtpsTime;
 use ros2probe_wire::walk::{self, Envelope};
 use ros2probe_wire::{Guid, Timestamp};
 
+/// Length of the header in front of the IP packet.
+const ETHERNET_LEN: usize = 14;
 /// Interface index of the frames.
 pub const INTERFACE: u32 = 1;
 
@@ -40,8 +43,21 @@ pub struct SocketResult {
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Hook {
     Wire,
+    TcxIngress,
+    TcxEgress,
     Ingress,
     Egress,
+}
+
+impl Hook {
+    /// Returns the hooks at interfaces that this kernel has.
+    pub fn at_interfaces() -> Vec<Self> {
+        match tcx::check() {
+            Ok(()) => vec![Self::Wire, Self::TcxIngress, Self::TcxEgress],
+            Err(TcxError::Unsupported) => vec![Self::Wire],
+            Err(error) => panic!("{error}: run the tests with sudo"),
+        }
+    }
 }
 
 /// A loaded filter, and the processing of fragments in user space.
@@ -68,6 +84,7 @@ impl Kernel {
         };
         let filter = match hook {
             Hook::Wire => Filter::load(&settings),
+            Hook::TcxIngress | Hook::TcxEgress => Filter::load_tcx(&settings),
             Hook::Ingress | Hook::Egress => Filter::load_host(&settings),
         };
         let filter = filter.expect("loading the kernel filter needs root: run the tests with sudo");
@@ -117,8 +134,11 @@ impl Kernel {
 
     /// Runs the program on one IP packet.
     pub fn frame(&mut self, packet: &[u8]) -> FrameResult {
-        let (kept, _) = self.run(packet, 1);
-        let kept = kept != 0;
+        let (result, _) = self.run(packet, 1);
+        let kept = match self.hook {
+            Hook::Wire => result != 0,
+            _ => self.kept_at_tcx(packet, result),
+        };
         self.now += 1;
         let mut ready = Vec::new();
         if kept {
@@ -153,6 +173,25 @@ impl Kernel {
         FrameResult { kept, records }
     }
 
+    /// Returns whether a program at tcx has passed a packet to user space, which must be the whole one
+    /// from its IP header on.
+    fn kept_at_tcx(&mut self, packet: &[u8], result: u32) -> bool {
+        /// `TCX_NEXT`.
+        const NEXT: u32 = -1_i32 as u32;
+        assert_eq!(result, NEXT, "a packet was not passed on: {packet:02x?}");
+        let mut bytes = Vec::new();
+        while let Some(piece) = self.filter.next_piece() {
+            let (piece, part) = piece.read().unwrap();
+            let outgoing = piece.flags & flag::OUTGOING != 0;
+            assert_ne!(piece.flags & flag::FRAME, 0);
+            assert_eq!(outgoing, self.hook == Hook::TcxEgress);
+            assert_eq!(piece.offset as usize, bytes.len(), "pieces come in order");
+            bytes.extend_from_slice(part);
+        }
+        assert!(bytes.is_empty() || bytes == packet, "the bytes are others");
+        !bytes.is_empty()
+    }
+
     /// Runs a program of the host hook on one datagram in one IP packet.
     pub fn datagram(&mut self, packet: &[u8]) -> SocketResult {
         let (verdict, _) = self.run(packet, 1);
@@ -183,7 +222,8 @@ impl Kernel {
             return;
         };
         if let Payload::Fragment(fragment) = &parsed.payload {
-            let key = FlowKey::new(0, INTERFACE, false, &parsed, fragment);
+            let outgoing = self.hook == Hook::TcxEgress;
+            let key = FlowKey::new(0, INTERFACE, outgoing, &parsed, fragment);
             let whole = self.reassembly.fragment(Timestamp(self.now), key, fragment);
             if let Some(rest) = whole.filter(|whole| whole.handover.is_some()) {
                 self.ahead.add_remainder(0, rest, |each| ready.push(each));
@@ -207,6 +247,8 @@ impl Kernel {
     pub fn program(&self) -> BorrowedFd<'_> {
         match self.hook {
             Hook::Wire | Hook::Ingress => self.filter.program(),
+            Hook::TcxIngress => self.filter.tcx_programs().unwrap()[0],
+            Hook::TcxEgress => self.filter.tcx_programs().unwrap()[1],
             Hook::Egress => self.filter.egress_program().unwrap(),
         }
     }
@@ -288,10 +330,29 @@ impl Kernel {
     pub fn run(&self, packet: &[u8], repeat: u32) -> (u32, Duration) {
         run(self.program(), packet, repeat)
     }
+
+    /// Runs the program on one IP packet, and returns the packet afterwards.
+    pub fn after_run(&self, packet: &[u8]) -> Vec<u8> {
+        let mut after = vec![0; ETHERNET_LEN + packet.len() + 64];
+        let len = run_into(self.program(), packet, 1, &mut after).2;
+        after[ETHERNET_LEN..len].to_vec()
+    }
 }
 
 /// Runs BPF_PROG_TEST_RUN. Returns the program's result, and its mean time.
 pub fn run(program: BorrowedFd<'_>, packet: &[u8], repeat: u32) -> (u32, Duration) {
+    let (result, mean, _) = run_into(program, packet, repeat, &mut []);
+    (result, mean)
+}
+
+/// Runs BPF_PROG_TEST_RUN, and writes the frame afterwards to `after`, unless that is empty. Also
+/// returns the length of that frame.
+fn run_into(
+    program: BorrowedFd<'_>,
+    packet: &[u8],
+    repeat: u32,
+    after: &mut [u8],
+) -> (u32, Duration, usize) {
     /// The head of `union bpf_attr` for BPF_PROG_TEST_RUN (linux/bpf.h).
     #[repr(C)]
     #[derive(Default)]
@@ -324,11 +385,16 @@ pub fn run(program: BorrowedFd<'_>, packet: &[u8], repeat: u32) -> (u32, Duratio
     let mut attributes = TestRun {
         prog_fd: program.as_raw_fd().cast_unsigned(),
         data_size_in: u32::try_from(frame.len()).unwrap(),
+        data_size_out: u32::try_from(after.len()).unwrap(),
         data_in: frame.as_ptr() as u64,
+        data_out: after.as_mut_ptr() as u64,
         repeat,
         ..TestRun::default()
     };
-    // SAFETY: the attribute's size is passed, and `frame` outlives the call.
+    if after.is_empty() {
+        attributes.data_out = 0;
+    }
+    // SAFETY: the attribute's size is passed, and both frames outlive the call.
     let result = unsafe {
         libc::syscall(
             libc::SYS_bpf,
@@ -345,6 +411,7 @@ pub fn run(program: BorrowedFd<'_>, packet: &[u8], repeat: u32) -> (u32, Duratio
     (
         attributes.retval,
         Duration::from_nanos(attributes.duration.into()),
+        attributes.data_size_out as usize,
     )
 }
 

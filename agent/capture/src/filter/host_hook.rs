@@ -19,8 +19,8 @@ use super::super::bpf;
 use super::super::error_chain::Reason;
 use super::super::tracepoints::{KernelLayout, Tracepoints};
 use super::{
-    Deliveries, Filter, FilterError, FilterSettings, NO_DELIVERIES, UNUSED_MAP_ENTRIES, failed,
-    load_program, open, ring_size, take,
+    Deliveries, Filter, FilterError, FilterSettings, NO_DELIVERIES, Reads, UNUSED_MAP_ENTRIES,
+    failed, load_program, open, ring_size, take,
 };
 
 /// Attach types of linux/bpf.h.
@@ -82,7 +82,7 @@ impl Filter {
         if !settings.deliveries {
             sizes.extend(NO_DELIVERIES);
         }
-        let mut ebpf = open(settings, true, &sizes, Some(&layout), 0)?;
+        let mut ebpf = open(settings, Reads::InPlace, &sizes, Some(&layout), 0)?;
         let ingress = load_program(&mut ebpf, "host_ingress")?;
         let egress = load_program(&mut ebpf, "host_egress")?;
         let zenoh = load_program(&mut ebpf, "zenoh_ingress")

@@ -15,7 +15,7 @@ pub use ros2probe_attach::library::Form;
 use ros2probe_attach::request::Place;
 
 use super::{
-    Filter, FilterError, FilterSettings, NO_DELIVERIES, OBJECT, UNUSED_MAP_ENTRIES, open,
+    Filter, FilterError, FilterSettings, NO_DELIVERIES, OBJECT, Reads, UNUSED_MAP_ENTRIES, open,
     ring_size, take,
 };
 use crate::breakpoints::{AttachMethod, Attached, Breakpoints};
@@ -45,7 +45,13 @@ impl Filter {
             ("CANDIDATES", UNUSED_MAP_ENTRIES),
         ];
         sizes.extend(NO_DELIVERIES);
-        let ebpf = open(settings, false, &sizes, None, within.unwrap_or(0))?;
+        let ebpf = open(
+            settings,
+            Reads::WithHelper,
+            &sizes,
+            None,
+            within.unwrap_or(0),
+        )?;
         let calls = Calls::SharedMemory;
         let mut breakpoints = Breakpoints::load(ebpf, &OBJECT.0, calls, None, means)?;
         let program = breakpoints.programs()?.into_iter().next();

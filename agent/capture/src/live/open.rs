@@ -135,6 +135,7 @@ pub(super) fn open_wires(
         ..limits
     };
     let wire = WireTapSettings {
+        wire: settings.wire,
         selection,
         ring_bytes: settings.ring_bytes,
         record_ring_bytes: settings.record_ring_bytes,

@@ -15,4 +15,5 @@ mod host_hook;
 mod inside;
 mod inside_processes;
 mod maps;
+mod tcx;
 mod zenoh;

@@ -398,6 +398,7 @@ impl Reader {
         let shm = shape.shm.unwrap_or_default();
         let settings = CaptureSettings {
             source: shape.source,
+            wire: shape.wire,
             cgroup: shape.cgroup.map(PathBuf::from),
             mirror_interfaces: shape.mirror_interfaces.unwrap_or_default(),
             include_interfaces: interfaces.include.unwrap_or_default(),

@@ -26,6 +26,7 @@ use crate::events::Trigger;
 pub use mistake::{Mistake, Mistakes, Position};
 pub use ros2probe_capture::settings::{
     CaptureSettings, ExactChoice, InsideChoice, LateChoice, ShmMode, ShmSettings, SourceChoice,
+    WireChoice,
 };
 use ros2probe_message::Dialect;
 pub use ros2probe_metrics::otlp::{Compression, Endpoint, OtlpProtocol, OtlpSettings};
@@ -475,6 +476,7 @@ impl Default for Config {
             limits: Limits::default(),
             capture: CaptureSettings {
                 source: SourceChoice::default(),
+                wire: WireChoice::default(),
                 cgroup: None,
                 mirror_interfaces: Vec::new(),
                 include_interfaces: Vec::new(),

@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use super::limits::LimitsShape;
 use super::{
     Access, Compression, ExactChoice, InsideChoice, LateChoice, Level, OtlpProtocol, PageChoice,
-    Retain, RetainChoice, ShmMode, SourceChoice, defaults,
+    Retain, RetainChoice, ShmMode, SourceChoice, WireChoice, defaults,
 };
 
 /// Configuration of the ros2probe agent. Every key is optional.
@@ -188,6 +188,9 @@ pub(super) enum RetainShape {
 pub(super) struct CaptureShape {
     /// Where packets are captured: at the sockets of this host, or on its interfaces.
     pub(super) source: SourceChoice,
+    /// How interfaces are observed. `tcx`: by programs at the interfaces, from Linux 6.6 on; `packet`:
+    /// by a packet socket, which costs large messages more; `auto`: `tcx` where the kernel has it.
+    pub(super) wire: WireChoice,
     /// Only the sockets of this cgroup (v2) and those below it, by absolute path; default: every
     /// socket of the host. Not with `source: wire`.
     pub(super) cgroup: Option<String>,
@@ -762,6 +765,7 @@ impl Default for CaptureShape {
     fn default() -> Self {
         Self {
             source: SourceChoice::default(),
+            wire: WireChoice::default(),
             cgroup: None,
             mirror_interfaces: None,
             interfaces: None,

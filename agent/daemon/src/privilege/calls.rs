@@ -271,6 +271,7 @@ impl Allowed {
                     .open_for_reading()?;
                 allowed.bpf([command::LINK_CREATE].into_iter())?;
             }
+            Role::Tcx => allowed.bpf([command::LINK_CREATE].into_iter())?,
             Role::SharedMemory { .. } => {
                 allowed
                     .allow(READ_METADATA)

@@ -9,8 +9,9 @@ use rustix::thread::{
     remove_capability_from_bounding_set, set_capabilities,
 };
 
-use crate::config::{CaptureSettings, SourceChoice};
+use crate::config::{CaptureSettings, SourceChoice, WireChoice};
 use ros2probe_capture::container::{FAMILIES_LINE, is_container, is_service};
+use ros2probe_capture::tcx;
 
 /// Capabilities for attaching programs to a cgroup (`CAP_NET_ADMIN`), for loading them (`CAP_BPF`),
 /// and for tracepoints and iterators (`CAP_PERFMON`). `CAP_PERFMON` also skips Spectre barriers in
@@ -21,7 +22,8 @@ const HOST_CAPABILITIES: [CapabilitySet; 3] = [
     CapabilitySet::PERFMON,
 ];
 
-/// Capabilities for packet sockets (`CAP_NET_RAW`); the others are as for the host's sockets.
+/// Capabilities for packet sockets (`CAP_NET_RAW`); the others are as for the host's sockets. Programs
+/// at tcx need those of [`HOST_CAPABILITIES`].
 const WIRE_CAPABILITIES: [CapabilitySet; 3] = [
     CapabilitySet::NET_RAW,
     CapabilitySet::BPF,
@@ -94,10 +96,22 @@ pub fn check(settings: &CaptureSettings) -> Result<(), Missing> {
     let Ok(effective) = raise() else {
         return Ok(());
     };
-    missing(effective, settings).map_or(Ok(()), Err)
+    let Some(missing_for_packets) = missing(effective, settings) else {
+        return Ok(());
+    };
+    let with_tcx = CaptureSettings {
+        wire: WireChoice::Tcx,
+        ..settings.clone()
+    };
+    let may_use_tcx = settings.wire == WireChoice::Auto && tcx::check().is_ok();
+    match may_use_tcx && missing(effective, &with_tcx).is_none() {
+        true => Ok(()),
+        false => Err(missing_for_packets),
+    }
 }
 
-/// Returns the capabilities that a process with the `effective` ones lacks; `None` if it has all.
+/// Returns the capabilities that a process with the `effective` ones lacks; `None` if it has all. For
+/// interfaces, packet sockets count, unless the configuration requires tcx.
 #[must_use]
 pub fn missing(effective: CapabilitySet, settings: &CaptureSettings) -> Option<Missing> {
     // `CAP_SYS_ADMIN`, which is older and wider, includes its successors.
@@ -123,9 +137,15 @@ fn candidates(settings: &CaptureSettings) -> Vec<(SourceChoice, Vec<CapabilitySe
     let named = !settings.include_interfaces.is_empty() || !settings.exclude_interfaces.is_empty();
     let mirrors = !settings.mirror_interfaces.is_empty();
     let entering = (!settings.network_namespaces.is_empty()).then_some(CapabilitySet::SYS_ADMIN);
-    let wire = || WIRE_CAPABILITIES.into_iter().chain(entering).collect();
+    let at_tcx = settings.wire == WireChoice::Tcx;
+    let of_wire = if at_tcx {
+        HOST_CAPABILITIES
+    } else {
+        WIRE_CAPABILITIES
+    };
+    let wire = || of_wire.into_iter().chain(entering).collect();
     let host = || {
-        let packets = [Some(CapabilitySet::NET_RAW), entering];
+        let packets = [(!at_tcx).then_some(CapabilitySet::NET_RAW), entering];
         let packets = packets.into_iter().flatten().filter(|_| mirrors);
         HOST_CAPABILITIES.into_iter().chain(packets).collect()
     };
@@ -394,6 +414,17 @@ mod tests {
         assert_eq!(
             lacks(&WIRE_CAPABILITIES, &entering),
             [[CapabilitySet::SYS_ADMIN]]
+        );
+        let at_tcx = |settings: &CaptureSettings| CaptureSettings {
+            wire: WireChoice::Tcx,
+            ..settings.clone()
+        };
+        for settings in [&named, &mirroring] {
+            assert!(lacks(&HOST_CAPABILITIES, &at_tcx(settings)).is_empty());
+        }
+        assert_eq!(
+            lacks(&WIRE_CAPABILITIES, &at_tcx(&named)),
+            [[CapabilitySet::NET_ADMIN]]
         );
         let old = [CapabilitySet::NET_RAW, CapabilitySet::SYS_ADMIN];
         assert!(lacks(&old, &entering).is_empty());

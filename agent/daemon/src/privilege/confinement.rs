@@ -63,6 +63,9 @@ pub enum Role {
         /// Whether the kernel requires `CAP_BPF`, as [`Role::reattach`] determines.
         needs_bpf: bool,
     },
+    /// Attaching loaded programs to interfaces that appear. No capability. It creates links, but opens
+    /// no socket and no file.
+    Tcx,
     /// Requests to the broker, which attaches programs to libraries. No capability.
     Exact,
     /// Like [`Role::Exact`], but also uses the programs' maps, and runs loaded programs at
@@ -165,7 +168,12 @@ impl Role {
             }
         };
         match self {
-            Self::Service | Self::Serve | Self::Export | Self::Ros2Daemon | Self::Exact => nothing,
+            Self::Service
+            | Self::Serve
+            | Self::Export
+            | Self::Ros2Daemon
+            | Self::Tcx
+            | Self::Exact => nothing,
             Self::Capture { needs_bpf } | Self::Inside { needs_bpf } => bpf(needs_bpf),
             Self::Reattach { needs_bpf } => CapabilitySet::NET_ADMIN | bpf(needs_bpf),
             Self::SharedMemory { needs_nice: false } => CapabilitySet::SYS_PTRACE,
@@ -256,6 +264,7 @@ pub fn spawn_source(
     let role = match task {
         Task::SharedMemory => Role::shared_memory(),
         Task::Reattach => Role::reattach(),
+        Task::Tcx => Role::Tcx,
         Task::Probes => Role::Exact,
         Task::Inside => Role::inside(),
     };

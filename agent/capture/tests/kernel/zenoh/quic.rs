@@ -1,6 +1,6 @@
 //! Connections over QUIC, of which only the first datagrams can be recognized.
 
-use super::tapped::Tapped;
+use super::tapped::{Tapped, hooks};
 use super::*;
 
 /// Datagrams with their server's port, and whether a QUIC connection of Zenoh begins with them.
@@ -72,9 +72,11 @@ fn quic_at_sockets_is_reported_only_on_a_port_of_zenoh() -> Result<()> {
 
 #[test]
 fn quic_on_interfaces_is_reported_only_on_a_port_of_zenoh() -> Result<()> {
-    for address in ["127.0.0.1", "[::1]"] {
+    let cases = hooks().into_iter();
+    let cases = cases.flat_map(|wire| ["127.0.0.1", "[::1]"].map(|address| (wire, address)));
+    for (wire, address) in cases {
         for (port, bytes, is_quic) in datagrams() {
-            let mut tapped = Tapped::new()?;
+            let mut tapped = Tapped::new(wire)?;
             netns::within(&tapped.host.network(), || exchange(address, port, &bytes))??;
             let deadline = Instant::now() + Duration::from_secs(if is_quic { 5 } else { 1 });
             let mut facts = None;

@@ -2,6 +2,14 @@
 
 use super::*;
 
+/// Returns the hooks at interfaces that this kernel has.
+pub fn hooks() -> Vec<WireChoice> {
+    match tcx::check() {
+        Ok(()) => vec![WireChoice::Packet, WireChoice::Tcx],
+        Err(_) => vec![WireChoice::Packet],
+    }
+}
+
 /// A tap on the interfaces of a namespace.
 pub struct Tapped {
     pub host: Namespace,
@@ -10,9 +18,10 @@ pub struct Tapped {
 }
 
 impl Tapped {
-    pub fn new() -> Result<Self> {
+    pub fn new(wire: WireChoice) -> Result<Self> {
         let host = Namespace::isolated()?;
         let settings = WireTapSettings {
+            wire,
             selection: Selection::new(&[], &[])?,
             ring_bytes: 8 << 20,
             record_ring_bytes: 1 << 20,
@@ -49,8 +58,10 @@ impl Tapped {
 
 #[test]
 fn only_frames_of_zenoh_connections_pass_on_any_port() -> Result<()> {
-    for address in ["127.0.0.1:0", "[::1]:0", "127.0.0.1:7447"] {
-        let mut tapped = Tapped::new()?;
+    let addresses = ["127.0.0.1:0", "[::1]:0", "127.0.0.1:7447"];
+    let cases = hooks().into_iter();
+    for (wire, address) in cases.flat_map(|wire| addresses.map(|address| (wire, address))) {
+        let mut tapped = Tapped::new(wire)?;
         let mut connection = tapped.connect(address)?;
         let sent = connections(LIFECYCLE)?.swap_remove(0);
         for (by_client, batch) in &sent {
@@ -72,64 +83,68 @@ fn only_frames_of_zenoh_connections_pass_on_any_port() -> Result<()> {
 
 #[test]
 fn a_connection_older_than_the_tap_is_found_on_any_port() -> Result<()> {
-    let mut tapped = Tapped::new()?;
-    let mut connection = tapped.connect("127.0.0.1:0")?;
-    let connections = connections(LIFECYCLE)?;
-    let sent = connections.iter().max_by_key(|sent| sent.len()).unwrap();
-    let steady: Vec<_> = sent.iter().filter(|(_, batch)| is_data(batch)).collect();
-    for (by_client, batch) in &steady {
-        pass(&mut connection, *by_client, &with_prefix(batch))?;
+    for wire in hooks() {
+        let mut tapped = Tapped::new(wire)?;
+        let mut connection = tapped.connect("127.0.0.1:0")?;
+        let connections = connections(LIFECYCLE)?;
+        let sent = connections.iter().max_by_key(|sent| sent.len()).unwrap();
+        let steady: Vec<_> = sent.iter().filter(|(_, batch)| is_data(batch)).collect();
+        for (by_client, batch) in &steady {
+            pass(&mut connection, *by_client, &with_prefix(batch))?;
+        }
+        let read = tapped.read(steady.len() as u64 - 20, None)?;
+        ensure!(
+            read + 20 >= steady.len() as u64,
+            "{read} of {}",
+            steady.len()
+        );
     }
-    let read = tapped.read(steady.len() as u64 - 20, None)?;
-    ensure!(
-        read + 20 >= steady.len() as u64,
-        "{read} of {}",
-        steady.len()
-    );
     Ok(())
 }
 
 #[test]
 fn a_connection_seen_at_the_sockets_is_not_reported_again_on_the_wire() -> Result<()> {
-    let mut tapped = Tapped::new()?;
-    let mut connection = tapped.connect("127.0.0.1:0")?;
-    let [client, server] = [connection[0].local_addr()?, connection[1].local_addr()?];
-    let place = |address: SocketAddr| Destination {
-        address: address
-            .ip()
-            .to_string()
-            .parse::<Ipv4Addr>()
-            .unwrap()
-            .to_ipv6_mapped()
-            .octets(),
-        port: address.port(),
-    };
-    let stream = StreamId {
-        flow: Flow {
-            source: place(client),
-            destination: place(server),
-        },
-        socket: 1,
-        ..StreamId::default()
-    };
-    let mut at_sockets = Streams::default();
-    let init = with_prefix(INIT);
-    let chunk = Chunk {
-        time: Timestamp(1),
-        stream,
-        sequence_number: 1,
-        syn: true,
-        end: false,
-        boundary: Some(Protocol::Zenoh),
-        before: MissingBefore::Unknown,
-        bytes: &init,
-        length: init.len() as u32,
-    };
-    at_sockets.chunk(&chunk, |_| {});
-    pass(&mut connection, true, &init)?;
-    pass(&mut connection, false, &init)?;
-    assert_eq!(tapped.read(1, Some(&at_sockets))?, 1, "the other direction");
-    assert!(tapped.tap.streams().follows_flow(&stream.flow.reversed()));
-    assert!(!tapped.tap.streams().follows_flow(&stream.flow));
+    for wire in hooks() {
+        let mut tapped = Tapped::new(wire)?;
+        let mut connection = tapped.connect("127.0.0.1:0")?;
+        let [client, server] = [connection[0].local_addr()?, connection[1].local_addr()?];
+        let place = |address: SocketAddr| Destination {
+            address: address
+                .ip()
+                .to_string()
+                .parse::<Ipv4Addr>()
+                .unwrap()
+                .to_ipv6_mapped()
+                .octets(),
+            port: address.port(),
+        };
+        let stream = StreamId {
+            flow: Flow {
+                source: place(client),
+                destination: place(server),
+            },
+            socket: 1,
+            ..StreamId::default()
+        };
+        let mut at_sockets = Streams::default();
+        let init = with_prefix(INIT);
+        let chunk = Chunk {
+            time: Timestamp(1),
+            stream,
+            sequence_number: 1,
+            syn: true,
+            end: false,
+            boundary: Some(Protocol::Zenoh),
+            before: MissingBefore::Unknown,
+            bytes: &init,
+            length: init.len() as u32,
+        };
+        at_sockets.chunk(&chunk, |_| {});
+        pass(&mut connection, true, &init)?;
+        pass(&mut connection, false, &init)?;
+        assert_eq!(tapped.read(1, Some(&at_sockets))?, 1, "the other direction");
+        assert!(tapped.tap.streams().follows_flow(&stream.flow.reversed()));
+        assert!(!tapped.tap.streams().follows_flow(&stream.flow));
+    }
     Ok(())
 }
