@@ -52,6 +52,10 @@ pub struct Health {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub source_reason: Option<String>,
+    /// How interfaces are observed; null if none are.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "openapi", schema(nullable = false))]
+    pub wire: Option<Wire>,
     /// Abilities, and whether the agent has each of them.
     pub abilities: Vec<Ability>,
     /// Capture points: network interfaces, or `sockets`.
@@ -187,6 +191,20 @@ pub struct Ability {
     /// The agent gains the ability while a client needs it (`capture.shm.exact: auto`).
     pub on_demand: bool,
     /// Why the agent lacks the ability; null if the agent has it or it is not requested.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "openapi", schema(nullable = false))]
+    pub reason: Option<String>,
+}
+
+/// How interfaces are observed.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+pub struct Wire {
+    /// `tcx`: by programs at the interfaces; `packet`: by packet sockets.
+    #[cfg_attr(feature = "openapi", schema(example = "tcx"))]
+    pub hook: Cow<'static, str>,
+    /// Why tcx is not used although the configuration permits it; null otherwise.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub reason: Option<String>,

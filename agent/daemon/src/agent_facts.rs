@@ -12,6 +12,15 @@ use ros2probe_api::recordings::BagTrigger;
 use ros2probe_capture::pcap::Speed;
 use ros2probe_model::facts::dispatch::MissedReason;
 
+/// How interfaces are observed.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct WireFacts {
+    /// `tcx` or `packet`.
+    pub hook: &'static str,
+    /// Why tcx is not used although the configuration permits it.
+    pub reason: Option<String>,
+}
+
 /// State of the agent at one moment.
 #[derive(Clone, Debug)]
 pub struct AgentFacts {
@@ -20,6 +29,8 @@ pub struct AgentFacts {
     /// Reason why the source with more visibility is not used. `None` if that source is used, or if
     /// the configuration selects `source`.
     pub source_reason: Option<String>,
+    /// How interfaces are observed; `None` if none are.
+    pub wire: Option<WireFacts>,
     /// Abilities of the source, each at most once.
     pub abilities: Vec<Ability>,
     /// Missing abilities that the source gains while a client needs them.
@@ -201,6 +212,7 @@ impl AgentFacts {
         Self {
             source,
             source_reason: None,
+            wire: None,
             abilities: source.abilities().to_vec(),
             on_demand: Vec::new(),
             missing_abilities: Vec::new(),

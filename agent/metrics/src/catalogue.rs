@@ -564,6 +564,7 @@ pub const CATALOGUE: &[Metric] = &[
     WATCH_VIOLATED,
     BUILD_INFO,
     SOURCE_INFO,
+    WIRE_INFO,
     SANDBOX_INFO,
     ABILITY,
     READY,

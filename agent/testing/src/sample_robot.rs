@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use ros2probe_daemon::agent_facts::{
-    AgentFacts, ExactFacts, InterfaceFacts, SharedMemoryFacts, SourceKind,
+    AgentFacts, ExactFacts, InterfaceFacts, SharedMemoryFacts, SourceKind, WireFacts,
 };
 use ros2probe_daemon::state::StateFacts;
 use ros2probe_model::derive::chain::exemplar::Exemplars;
@@ -463,6 +463,10 @@ pub fn agent() -> AgentFacts {
             dropped: Some(0),
         }],
         filter_events: vec![("ignore", 7), ("meter", 8), ("capture", 9)],
+        wire: Some(WireFacts {
+            hook: "packet",
+            reason: Some("the kernel has no tcx (Linux 6.6)".to_owned()),
+        }),
         copied_bytes: 12_345,
         state: Some(StateFacts {
             writes: 3,

@@ -18,6 +18,8 @@ pub struct Visibility {
     pub source: String,
     /// Reason why the source with more visibility is not used.
     pub source_reason: Option<String>,
+    /// How interfaces are observed, and why tcx is not used; `None` if none are observed.
+    pub wire: Option<(String, Option<String>)>,
     /// Available abilities.
     pub able: Vec<Ability>,
     /// Unavailable abilities, each with the reason.
@@ -39,6 +41,10 @@ impl Visibility {
         Self {
             source: health.source.to_string(),
             source_reason: health.source_reason.clone(),
+            wire: health
+                .wire
+                .as_ref()
+                .map(|wire| (wire.hook.to_string(), wire.reason.clone())),
             able: able.filter_map(|each| known(&each.ability)).collect(),
             reasons: reasons.collect(),
             from: HEALTH_SOURCE,
@@ -51,6 +57,7 @@ impl Visibility {
         Self {
             source: facts.source.label().to_owned(),
             source_reason: facts.source_reason,
+            wire: facts.wire.map(|wire| (wire.hook.to_owned(), wire.reason)),
             able: facts.abilities,
             reasons: facts.missing_abilities,
             from: TRIAL_SOURCE,
@@ -86,6 +93,7 @@ pub fn failed_trial_findings(error: &str) -> Vec<Finding> {
 #[must_use]
 pub fn check(visibility: &Visibility) -> Vec<Finding> {
     let mut findings = vec![source(visibility)];
+    findings.extend(wire(visibility));
     let able = |ability: &Ability| visibility.able.contains(ability);
     let (seen, blind): (Vec<_>, Vec<_>) = Ability::ALL.into_iter().partition(able);
     let seen: Vec<_> = seen.into_iter().map(words).collect();
@@ -100,6 +108,32 @@ pub fn check(visibility: &Visibility) -> Vec<Finding> {
             .filter_map(|ability| missing_ability_finding(visibility, ability)),
     );
     findings
+}
+
+/// Returns the finding on how interfaces are observed; `None` if none are.
+fn wire(visibility: &Visibility) -> Option<Finding> {
+    let (hook, reason) = visibility.wire.as_ref()?;
+    let sentence = match reason {
+        Some(reason) => format!(
+            "interfaces are observed by packet sockets, which cost senders of large messages \
+             more: {reason}"
+        ),
+        None => format!("interfaces are observed by {}", hook_words(hook)),
+    };
+    let severity = match reason {
+        Some(_) => Severity::Note,
+        None => Severity::Ok,
+    };
+    let finding = Finding::new(AREA, "wire", severity, sentence);
+    Some(finding.seen(hook, visibility.from))
+}
+
+fn hook_words(hook: &str) -> &str {
+    match hook {
+        "tcx" => "programs at tcx",
+        "packet" => "packet sockets, as configured",
+        other => other,
+    }
 }
 
 fn source(visibility: &Visibility) -> Finding {

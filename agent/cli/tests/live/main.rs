@@ -49,6 +49,7 @@ mod shm;
 mod shm_exact;
 mod sources;
 mod start_orders;
+mod tcx;
 mod type_objects;
 mod unnoticed;
 

@@ -17,7 +17,7 @@ use std::sync::mpsc;
 use std::time::Duration;
 
 use anyhow::{Context as _, Result, ensure};
-use ros2probe_capture::netns;
+use ros2probe_capture::{netns, tcx};
 use ros2probe_daemon::agent_facts::{Ability, SourceKind};
 use ros2probe_testing::harness;
 use ros2probe_testing::harness::agent::{Agent, Scrape, at_the_sockets_of};
@@ -106,6 +106,25 @@ fn an_agent_with_capabilities_for_the_wire_only_reports_it() -> Result<()> {
     );
     let label = [("ability", Ability::SocketLosses.label())];
     assert_eq!(page.sum("ros2probe_capture_ability", &label), 0.0);
+    Ok(())
+}
+
+#[test]
+fn the_capabilities_of_the_host_source_suffice_at_tcx() -> Result<()> {
+    if tcx::check().is_err() {
+        return Ok(());
+    }
+    let link = Link::new()?;
+    let directory = tempfile::tempdir()?;
+    let capabilities = "+net_admin,+bpf,+perfmon";
+    let capture = "capture: {source: wire}\n";
+    let agent = start(&link.monitor, directory.path(), capabilities, capture)?;
+    let hooks = agent
+        .scrape()?
+        .labels_of("ros2probe_capture_wire_info", "hook");
+    ensure!(hooks == BTreeSet::from(["tcx".to_owned()]), "{hooks:?}");
+    let names = confined(agent.process.pid(), 65534)?;
+    ensure!(names.contains("tcx"), "no tcx in {names:?}");
     Ok(())
 }
 

@@ -18,6 +18,7 @@ use injection::Injection;
 use ros2probe_capture::frame_decoder::FrameDecoder;
 use ros2probe_capture::pcap::PcapReader;
 use ros2probe_capture::reassembly::Limits;
+use ros2probe_capture::tcx;
 use ros2probe_daemon::config::{Config, Watchlist};
 use ros2probe_model::facts::loss::Loss;
 use ros2probe_model::observe::input::Input;
@@ -112,9 +113,15 @@ impl<'a> Sending<'a> {
     fn compare(&self) -> Result<String> {
         let path = self.cgroup.path().display();
         let at_sockets = format!("{ALL_TOPICS}capture: {{source: host, cgroup: {path}}}\n");
-        let on_wire = format!("{ALL_TOPICS}capture: {{source: wire}}\n");
+        let on_wire = |hook| format!("{ALL_TOPICS}capture: {{source: wire, wire: {hook}}}\n");
         let start = |configuration: &str| Witness::start_on(&self.host, configuration);
-        let mut witnesses = [("host", start(&at_sockets)?), ("wire", start(&on_wire)?)];
+        let mut witnesses = vec![
+            ("host", start(&at_sockets)?),
+            ("packet", start(&on_wire("packet"))?),
+        ];
+        if tcx::check().is_ok() {
+            witnesses.push(("tcx", start(&on_wire("tcx"))?));
+        }
         let sent = self.injection.run(SPEED)?;
         std::thread::sleep(SETTLE);
         let file = Counts::replayed(self.capture)?;

@@ -13,7 +13,7 @@ use super::RunError;
 use super::replay::Replay;
 use crate::agent_facts::{
     Ability, AgentFacts, ExactFacts, InsideLibrary, InsideSourceFacts, InterfaceFacts,
-    SharedMemoryFacts, SourceKind,
+    SharedMemoryFacts, SourceKind, WireFacts,
 };
 use crate::config::{CaptureSettings, ExactChoice, InsideChoice};
 use ros2probe_capture::error_chain::Reason;
@@ -63,7 +63,11 @@ impl Source {
     pub fn announce(&self, settings: &CaptureSettings) {
         let Self::Live(live) = self else { return };
         if let Some(reason) = live.without_host() {
-            tracing::warn!("host hook not used: {reason}; using packet sockets");
+            tracing::warn!("host hook not used: {reason}; observing interfaces");
+        }
+        if let Some(hook) = live.wire_hook() {
+            let (hook, reason) = (hook.label(), live.without_tcx());
+            tracing::info!(hook, reason, "observing interfaces");
         }
         if let Some(reason) = live.without_exact() {
             let text = format!("capture.shm.exact not used: {reason}; shared memory is sampled");
@@ -281,6 +285,10 @@ fn live_facts(live: &mut LiveSource, now: Instant) -> AgentFacts {
         pieces_bytes: live.waiting_bytes() as u64,
         refused_updates: live.refused_updates(),
         source_reason: live.without_host().map(str::to_owned),
+        wire: live.wire_hook().map(|hook| WireFacts {
+            hook: hook.label(),
+            reason: live.without_tcx().map(str::to_owned),
+        }),
         abilities: abilities(live),
         on_demand: on_demand(live),
         missing_abilities: blind(live),

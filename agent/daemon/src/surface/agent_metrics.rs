@@ -32,6 +32,12 @@ pub(super) fn identity(sink: &mut MetricSink<'_>, state: &State, now: Instant) -
         let reason = state.agent.source_reason.as_deref().unwrap_or_default();
         family.info(&[Label::Text(state.agent.source.label()), Label::Text(reason)])
     })?;
+    sink.family(&metric::WIRE_INFO, |family| {
+        state.agent.wire.iter().try_for_each(|wire| {
+            let reason = wire.reason.as_deref().unwrap_or_default();
+            family.info(&[Label::Text(wire.hook), Label::Text(reason)])
+        })
+    })?;
     sink.family(&metric::SANDBOX_INFO, |family| {
         let sandbox = &state.agent.sandbox;
         let reason = sandbox.reason().unwrap_or_default();

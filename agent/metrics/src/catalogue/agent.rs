@@ -13,6 +13,12 @@ pub const SOURCE_INFO: Metric = Metric::info(
     "The source of packets: the host's sockets, the wire or a replay, and why a source that \
      shows more is not used.",
 );
+pub const WIRE_INFO: Metric = Metric::info(
+    "ros2probe_capture_wire_info",
+    &["hook", "reason"],
+    "How interfaces are observed: by programs at `tcx`, or by `packet` sockets and why tcx is not \
+     used. Absent if no interface is observed.",
+);
 pub const SANDBOX_INFO: Metric = Metric::info(
     "ros2probe_sandbox_info",
     &["system_calls", "reason"],

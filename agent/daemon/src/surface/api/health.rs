@@ -17,7 +17,7 @@ use crate::privilege;
 use crate::surface::foxglove::{ViewerListener, Viewers};
 use crate::surface::process::Process;
 use crate::surface::ros2_daemon::{PortState, Ros2DaemonFigures, port};
-use ros2probe_api::health::{self, Health, Interface, Limit, Table, Thread};
+use ros2probe_api::health::{self, Health, Interface, Limit, Table, Thread, Wire};
 use ros2probe_metrics::otlp::Host;
 
 /// Name of the host. It is read once, because it rarely changes while the agent runs.
@@ -74,6 +74,10 @@ async fn health(State(context): State<Context>) -> Json<Health> {
             .map(str::to_owned),
         topics_rejected: snapshot.map_or(0, |snapshot| snapshot.topics_rejected),
         source_reason: agent.source_reason.clone(),
+        wire: agent.wire.as_ref().map(|wire| Wire {
+            hook: wire.hook.into(),
+            reason: wire.reason.clone(),
+        }),
         abilities: abilities(agent),
         interfaces: interfaces
             .map(|each| Interface {
