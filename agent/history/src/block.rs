@@ -29,6 +29,8 @@ pub enum Kind {
     Events,
     /// A record of a queue.
     Queued,
+    /// Documents, or what changed in them.
+    Documents,
 }
 
 /// A block with its content.
@@ -56,12 +58,13 @@ pub(crate) struct Header {
 }
 
 impl Kind {
-    const ALL: [Self; 5] = [
+    const ALL: [Self; 6] = [
         Self::Topics,
         Self::Processes,
         Self::State,
         Self::Events,
         Self::Queued,
+        Self::Documents,
     ];
 }
 

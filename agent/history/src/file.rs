@@ -67,6 +67,12 @@ impl Blocks {
         self.write(blocks, |_| Ok(()))
     }
 
+    /// Appends blocks as [`Self::append`] does, and returns the file.
+    pub(crate) fn with(mut self, blocks: &[Block]) -> io::Result<Self> {
+        self.append(blocks)?;
+        Ok(self)
+    }
+
     /// Appends blocks as [`Self::append`] does, and waits until they are on disk.
     pub(crate) fn append_durably(&mut self, blocks: &[Block]) -> io::Result<()> {
         self.write(blocks, File::sync_data)

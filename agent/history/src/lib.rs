@@ -1,8 +1,10 @@
-//! History on disk: figures of each topic and process, states of the robot, and events, for days.
+//! History on disk: figures of each topic and process, states of the robot, events, and what its
+//! views contained, for days.
 //!
-//! A [`Store`] is a directory with two tiers of append-only files. [`Tier::Seconds`] has rows of one
-//! second. [`Tier::Tens`] has the same rows merged into steps of ten seconds, which reach further
-//! back within the same number of bytes. Each file consists of blocks with a checksum; a
+//! A [`Store`] is a directory with three tiers of append-only files. [`Tier::Seconds`] has rows of
+//! one second. [`Tier::Tens`] has the same rows merged into steps of ten seconds, which reach further
+//! back within the same number of bytes. [`Tier::Documents`] has versions of [`Document`]s, of which
+//! only the changes are stored. Each file consists of blocks with a checksum; a
 //! block that a power cut damaged is skipped, and the rest stays readable. The oldest file of a tier
 //! is deleted when the tier exceeds its part of the limit.
 //!
@@ -29,6 +31,8 @@
 mod block;
 mod bytes;
 mod columns;
+mod delta;
+mod documents;
 mod file;
 mod merge;
 mod queue;
@@ -36,6 +40,7 @@ mod rows;
 mod store;
 
 pub use block::{Block, Kind};
+pub use documents::{Document, DocumentVersion};
 pub use merge::{merge_by_name, merge_into, merged};
 pub use queue::{Queue, Record};
 pub use rows::{ProcessName, ProcessRow, Series, TopicName, TopicRow};

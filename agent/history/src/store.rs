@@ -1,4 +1,4 @@
-//! The directory of files: two tiers, their budgets, and what is read from them.
+//! The directory of files: three tiers, their budgets, and what is read from them.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -10,6 +10,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use crate::block::{Block, Kind};
 use crate::columns::{self, Name, Row};
+use crate::documents::{Document, DocumentVersion, VersionReader, Versions};
 use crate::file::Blocks;
 use crate::merge::{Merge, merge_by_name};
 use crate::rows::{ProcessName, ProcessRow, Series, TopicName, TopicRow};
@@ -28,6 +29,8 @@ const MAX_FILES: usize = 256;
 const MIN_FREE: u64 = 64 << 20;
 /// File name extension.
 const FILE_EXTENSION: &str = "history";
+/// Maximum length of all documents of a time, in bytes, before they are compressed.
+const MAX_DOCUMENT_BYTES: u64 = 4 << 20;
 
 /// Resolution of rows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -36,6 +39,8 @@ pub enum Tier {
     Seconds,
     /// One row per ten seconds, and a state per ten minutes.
     Tens,
+    /// Documents.
+    Documents,
 }
 
 /// History in a directory. Readers never wait for the writer.
@@ -44,7 +49,9 @@ pub struct Store {
     directory: PathBuf,
     /// Maximum size of all files, in bytes.
     limit: u64,
-    tiers: Mutex<[Vec<Blocks>; 2]>,
+    tiers: Mutex<[Vec<Blocks>; 3]>,
+    /// Versions of the documents that were written last. Only the writer locks them.
+    versions: Mutex<Versions>,
 }
 
 /// Times from which a tier has blocks.
@@ -67,23 +74,28 @@ pub struct Facts {
     pub seconds: Option<Span>,
     /// Reach of [`Tier::Tens`]; `None` without a block.
     pub tens: Option<Span>,
+    /// Reach of [`Tier::Documents`]; `None` without a block.
+    pub documents: Option<Span>,
 }
 
 impl Tier {
-    const ALL: [Self; 2] = [Self::Seconds, Self::Tens];
+    const ALL: [Self; 3] = [Self::Seconds, Self::Tens, Self::Documents];
 
     const fn name(self) -> &'static str {
         match self {
             Self::Seconds => "seconds",
             Self::Tens => "tens",
+            Self::Documents => "documents",
         }
     }
 
-    /// Returns the tier's part of a limit: two thirds and one third.
+    /// Returns the tier's part of a limit: an eighth is for documents. Of the rest, two thirds are
+    /// for seconds and one third for steps of ten seconds.
     const fn budget(self, limit: u64) -> u64 {
         match self {
-            Self::Seconds => limit / 3 * 2,
-            Self::Tens => limit / 3,
+            Self::Seconds => limit / 24 * 14,
+            Self::Tens => limit / 24 * 7,
+            Self::Documents => limit / 24 * 3,
         }
     }
 
@@ -92,6 +104,8 @@ impl Tier {
         match self {
             Self::Seconds => 3_600,
             Self::Tens => 12 * 3_600,
+            // A damaged block hides the changes until the next file.
+            Self::Documents => 3 * 3_600,
         }
     }
 }
@@ -103,7 +117,7 @@ impl Store {
     ///
     /// Fails if the directory cannot be read.
     pub fn open(directory: &Path, limit: u64) -> io::Result<Self> {
-        let mut tiers: [Vec<Blocks>; 2] = Default::default();
+        let mut tiers: [Vec<Blocks>; 3] = Default::default();
         let entries = match fs::read_dir(directory) {
             Err(error) if error.kind() == io::ErrorKind::NotFound => None,
             entries => Some(entries?),
@@ -124,6 +138,7 @@ impl Store {
             directory: directory.to_path_buf(),
             limit,
             tiers: Mutex::new(tiers),
+            versions: Mutex::default(),
         })
     }
 
@@ -138,20 +153,10 @@ impl Store {
             return Ok(());
         };
         prepare(&self.directory)?;
-        let budget = tier.budget(self.limit);
-        let mut file = match self.files(tier).pop() {
-            // After a step back of the clock, a new file keeps the two times apart.
-            Some(last)
-                if last.length < budget / FILES_PER_TIER
-                    && begin.abs_diff(last.begin) < tier.span()
-                    && match tier {
-                        Tier::Seconds => !is_set_back(last.end, begin),
-                        Tier::Tens => first.begin >= last.end,
-                    } =>
-            {
-                last
-            }
-            _ => Blocks::create(self.free_path(tier, begin), begin)?,
+        let unfinished = self.unfinished(tier, begin, (first.begin, first.end));
+        let mut file = match unfinished {
+            Some(file) => file,
+            None => Blocks::create(self.free_path(tier, begin), begin)?,
         };
         match file.append(blocks) {
             // An operator has deleted the file to gain space.
@@ -161,11 +166,73 @@ impl Store {
             }
             appended => appended?,
         }
+        self.finish_append(tier, file);
+        Ok(())
+    }
+
+    /// Appends the documents of a time: whole ones at the begin of a file, and later what changed.
+    /// All of them take 4 MiB at most, and half of the tier's part of the limit. A document without
+    /// room is left out.
+    ///
+    /// # Errors
+    ///
+    /// Fails if they cannot be written, or if little space is free. The store is as before.
+    pub fn append_documents(
+        &self,
+        begin: u32,
+        end: u32,
+        documents: impl Iterator<Item = Document>,
+    ) -> io::Result<()> {
+        let tier = Tier::Documents;
+        let most = (tier.budget(self.limit) / 2).min(MAX_DOCUMENT_BYTES);
+        let mut versions = self.versions.lock().unwrap_or_else(PoisonError::into_inner);
+        prepare(&self.directory)?;
+        let continued = self.unfinished(tier, begin, (begin, end)).filter(|file| {
+            // An operator may have deleted the file to gain space.
+            Some(&file.path) == versions.path.as_ref() && file.path.exists()
+        });
+        let file = match continued {
+            Some(file) => file,
+            None => {
+                versions.forget();
+                Blocks::create(self.free_path(tier, begin), begin)?
+            }
+        };
+        let content = versions.block(documents, most as usize);
+        versions.path = None;
+        let file = file.with(&[Block {
+            kind: Kind::Documents,
+            begin,
+            end,
+            content,
+        }])?;
+        versions.path = Some(file.path.clone());
+        drop(versions);
+        self.finish_append(tier, file);
+        Ok(())
+    }
+
+    /// Returns the last file of a tier if blocks continue it that begin at `begin`, the first of them
+    /// with these times.
+    fn unfinished(&self, tier: Tier, begin: u32, first: (u32, u32)) -> Option<Blocks> {
+        let last = self.files(tier).pop()?;
+        // After a step back of the clock, a new file keeps the two times apart.
+        let is_continued = last.length < tier.budget(self.limit) / FILES_PER_TIER
+            && begin.abs_diff(last.begin) < tier.span()
+            && match tier {
+                Tier::Seconds => !is_set_back(last.end, begin),
+                Tier::Tens => first.0 >= last.end,
+                Tier::Documents => first.1 >= last.end,
+            };
+        is_continued.then_some(last)
+    }
+
+    /// Stores the new state of a file, and deletes the oldest files that exceed the tier's budget.
+    fn finish_append(&self, tier: Tier, file: Blocks) {
         // A slow storage must not hold the lock, for which readers would wait.
-        for excess in self.replace_last(tier, file, budget) {
+        for excess in self.replace_last(tier, file, tier.budget(self.limit)) {
             let _ = fs::remove_file(excess.path);
         }
-        Ok(())
     }
 
     /// Stores the new state of the last file of a tier. Returns the oldest files that exceed the
@@ -266,7 +333,8 @@ impl Store {
     /// Returns the latest state of the robot at this time; `None` if no earlier one is kept.
     #[must_use]
     pub fn state(&self, time: u32) -> Option<Block> {
-        let states = Tier::ALL.into_iter().filter_map(|tier| {
+        let tiers = [Tier::Seconds, Tier::Tens];
+        let states = tiers.into_iter().filter_map(|tier| {
             let mut files = self.files(tier);
             files.retain(|file| file.begin <= time);
             files.sort_by_key(|file| file.begin);
@@ -278,6 +346,28 @@ impl Store {
         states.max_by_key(|state| state.end)
     }
 
+    /// Returns a document as it was at this time; `None` if it was not kept, or is damaged.
+    #[must_use]
+    pub fn document(&self, name: &str, time: u32) -> Option<DocumentVersion> {
+        let mut files = self.files(Tier::Documents);
+        files.retain(|file| file.begin <= time);
+        files.sort_by_key(|file| file.begin);
+        for file in files.iter().rev() {
+            let (mut reader, mut last) = (VersionReader::new(name), None);
+            file.visit(Kind::Documents, &(0..u32::MAX), &mut |block| {
+                if block.end <= time {
+                    reader.read(&block.content);
+                    last = Some(block.end);
+                }
+            });
+            if let Some(at) = last {
+                let content = reader.content()?;
+                return Some(DocumentVersion { at, content });
+            }
+        }
+        None
+    }
+
     /// Returns size and reach.
     #[must_use]
     pub fn facts(&self) -> Facts {
@@ -287,6 +377,7 @@ impl Store {
             limit: self.limit,
             seconds: self.span(Tier::Seconds),
             tens: self.span(Tier::Tens),
+            documents: self.span(Tier::Documents),
         }
     }
 
@@ -308,7 +399,7 @@ impl Store {
         files.map(|file| file.begin).min()
     }
 
-    fn lock(&self) -> MutexGuard<'_, [Vec<Blocks>; 2]> {
+    fn lock(&self) -> MutexGuard<'_, [Vec<Blocks>; 3]> {
         self.tiers.lock().unwrap_or_else(PoisonError::into_inner)
     }
 

@@ -4,12 +4,16 @@
 
 use std::fs;
 
-use ros2probe_history::{Block, Series, Store, Tier, TopicName, TopicRow};
+use ros2probe_history::{Block, Document, Series, Store, Tier, TopicName, TopicRow};
 
 /// Default of `limits.topics`.
 const TOPICS: u32 = 1000;
 /// Documented memory without events, in KiB (docs/limits.md).
 const ALLOWED: u64 = 6 << 10;
+/// Documented memory of documents, in KiB (docs/limits.md).
+const ALLOWED_FOR_DOCUMENTS: u64 = 14 << 10;
+/// Maximum length of all documents, in bytes.
+const DOCUMENTS: usize = 4 << 20;
 
 fn minute(begin: u32) -> Vec<Series<TopicName, TopicRow>> {
     let series = |topic| Series {
@@ -53,4 +57,38 @@ fn a_minute_of_all_topics_is_written_within_the_documented_memory() {
     let most = peak() - before;
     println!("{most} KiB");
     assert!(most <= ALLOWED, "{most} KiB");
+}
+
+#[test]
+fn the_largest_documents_are_written_within_the_documented_memory() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = Store::open(directory.path(), 256 << 20).unwrap();
+    // In one document, each number changes with each minute.
+    let document = |minute: u32| {
+        let mut content = Vec::with_capacity(DOCUMENTS);
+        for row in 0_u32.. {
+            let number = row.wrapping_mul(2_654_435_761).wrapping_add(minute);
+            let row = format!(r#"{{"name":"/part_{row}","messages":{number},"level":"ok"}},"#);
+            if content.len() + row.len() > DOCUMENTS {
+                break;
+            }
+            content.extend_from_slice(row.as_bytes());
+        }
+        Document {
+            name: "topics".into(),
+            content,
+        }
+    };
+    store.append_documents(0, 60, std::iter::empty()).unwrap();
+    let before = peak();
+    for minute in 1..5 {
+        let documents = std::iter::once_with(|| document(minute));
+        let begin = minute * 60;
+        store
+            .append_documents(begin, begin + 60, documents)
+            .unwrap();
+    }
+    let most = peak() - before;
+    println!("{most} KiB");
+    assert!(most <= ALLOWED_FOR_DOCUMENTS, "{most} KiB");
 }
