@@ -5,6 +5,78 @@ use serde::{Deserialize, Serialize};
 /// Header of an answer with `true` if its oldest lines are missing.
 pub const TRUNCATED_HEADER: &str = "ros2probe-truncated";
 
+/// A noun whose answer the history keeps.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(rename_all = "snake_case")]
+pub enum KeptNoun {
+    /// `/parameters`.
+    Parameters,
+    /// `/diagnostics`.
+    Diagnostics,
+    /// `/transforms`.
+    Transforms,
+    /// `/clocks`.
+    Clocks,
+    /// `/chains`.
+    Chains,
+    /// `/actions`.
+    Actions,
+    /// `/services`.
+    Services,
+    /// `/health`.
+    Health,
+    /// `/logs` with all messages that the agent had.
+    Logs,
+    /// `/participants`.
+    Participants,
+    /// `/nodes`.
+    Nodes,
+    /// `/graph`.
+    Graph,
+    /// Details of each topic, without measurements and histograms.
+    Topics,
+}
+
+impl KeptNoun {
+    /// All nouns. If they are too large together, the last ones are left out.
+    pub const ALL: [Self; 13] = [
+        Self::Parameters,
+        Self::Diagnostics,
+        Self::Transforms,
+        Self::Clocks,
+        Self::Chains,
+        Self::Actions,
+        Self::Services,
+        Self::Health,
+        Self::Logs,
+        Self::Participants,
+        Self::Nodes,
+        Self::Graph,
+        Self::Topics,
+    ];
+
+    /// Returns the word in the path.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Parameters => "parameters",
+            Self::Diagnostics => "diagnostics",
+            Self::Transforms => "transforms",
+            Self::Clocks => "clocks",
+            Self::Chains => "chains",
+            Self::Actions => "actions",
+            Self::Services => "services",
+            Self::Health => "health",
+            Self::Logs => "logs",
+            Self::Participants => "participants",
+            Self::Nodes => "nodes",
+            Self::Graph => "graph",
+            Self::Topics => "topics",
+        }
+    }
+}
+
 /// Size and reach of the history on disk.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
@@ -20,6 +92,8 @@ pub struct DiskHistory {
     pub seconds: Option<HistorySpan>,
     /// Reach of the rows of ten seconds and of the states of ten minutes.
     pub tens: Option<HistorySpan>,
+    /// Reach of the answers of `/history/moment/{noun}`.
+    pub answers: Option<HistorySpan>,
     /// Minutes that this run of the agent wrote.
     pub writes: u64,
     /// Minutes that could not be written.

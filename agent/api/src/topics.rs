@@ -95,6 +95,37 @@ pub struct TopicDetails<'a> {
     pub acknowledgements: Vec<Acknowledgement<'a>>,
 }
 
+/// Topics with their details, as the history has them.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+pub struct TopicDetailsList<'a> {
+    /// Unix time of the state that this answer describes.
+    pub timestamp_seconds: f64,
+    /// Topics, sorted by domain and DDS name.
+    pub topics: Vec<TopicDetails<'a>>,
+}
+
+impl TopicDetails<'_> {
+    /// Returns the details without what changes with each message: measurements, histograms, and
+    /// acknowledgements of readers that do not lag.
+    #[must_use]
+    pub fn without_figures(mut self) -> Self {
+        let topic = &mut self.topic;
+        (topic.measurement, topic.received, topic.sent) = (None, None, None);
+        topic.breakdown = None;
+        for endpoint in topic.publishers.iter_mut().chain(&mut topic.subscriptions) {
+            endpoint.measurement = None;
+        }
+        self.acknowledgements.retain(|each| each.lag_messages > 0);
+        Self {
+            interarrival_buckets: Vec::new(),
+            latency_buckets: Vec::new(),
+            ..self
+        }
+    }
+}
+
 /// Publisher and subscriber pairs that use the same transport.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]

@@ -43,6 +43,19 @@ fn the_history_has_every_message_before_the_end_of_the_agent() -> Result<()> {
         moment.contains("\"/imu\"") && moment.contains("{\"values\""),
         "{moment}"
     );
+    // The endpoints and deliveries of a topic that no longer exists.
+    let topics = scene
+        .place
+        .ask(&format!("/history/moment/topics?at={now}"))?;
+    let all = topics["topics"].as_array().context("no topics")?;
+    let imu = all.iter().find(|topic| topic["name"] == "/imu");
+    let imu = imu.with_context(|| topics.to_string())?;
+    ensure!(
+        imu["publishers"][0]["qos"]["reliability"] == "BEST_EFFORT"
+            && imu["measurement"].is_null()
+            && imu["deliveries"][0]["delivered"]["messages"].as_u64() > Some(100),
+        "{imu}"
+    );
     Ok(())
 }
 

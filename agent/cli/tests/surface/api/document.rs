@@ -289,7 +289,8 @@ fn bounds_of_queries(agent: &LocalAgent, document: &Value, check: Check<'_>) {
         };
         let path = path
             .replace("{topic}", "chatter")
-            .replace("{node}", "talker");
+            .replace("{node}", "talker")
+            .replace("{noun}", "chains");
         for parameter in parameters
             .iter()
             .filter(|parameter| parameter["in"] == "query")

@@ -13,6 +13,7 @@ fn a_replay_keeps_no_history_on_disk_and_reports_the_reason() {
     assert_eq!(about["seconds"], Value::Null);
     for path in [
         "/history/moment?at=1790000000",
+        "/history/moment/parameters?at=1790000000",
         "/history/processes",
         "/history/events?from=1&to=2",
         "/topics/points/history?from=1&to=2",
@@ -29,6 +30,8 @@ fn a_replay_keeps_no_history_on_disk_and_reports_the_reason() {
         "/history/processes?from=3&to=2",
         "/history/events?to=-1",
         "/history/moment?at=1e12",
+        "/history/moment/chains?at=1e12",
+        "/history/moment/doctor?at=1790000000",
         "/topics/points/history?step=0",
     ] {
         let answer = request(agent.api, "GET", path, "");

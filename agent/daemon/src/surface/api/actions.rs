@@ -39,10 +39,14 @@ async fn list(
 ) -> Result<Response, Problem> {
     let scope = scope.checked()?;
     let state = context.state().await;
-    let snapshot = state.known();
+    Ok(Json(answer(state.known(), scope)).into_response())
+}
+
+/// Returns the answer with the actions of a scope.
+pub(super) fn answer(snapshot: &Snapshot, scope: Scope) -> ActionList<'_> {
     let index = Index::new(snapshot);
     let actions = actions(snapshot, scope).into_iter();
-    let answer = ActionList {
+    ActionList {
         timestamp_seconds: snapshot.time().seconds(),
         actions: actions
             .filter_map(|((domain_id, name), parts)| {
@@ -51,8 +55,7 @@ async fn list(
                 Some(Action { goals, ..action })
             })
             .collect(),
-    };
-    Ok(Json(answer).into_response())
+    }
 }
 
 /// Groups the topics of actions by domain and name. The topics are always hidden, but an action is

@@ -8,7 +8,7 @@ use axum::response::{IntoResponse, Response};
 use ros2probe_api::chains::{Chain, ChainList, ExpectedChain, Hop, Quantiles};
 use ros2probe_model::derive::chain::expected::ExpectedFacts;
 use ros2probe_model::derive::chain::path;
-use ros2probe_model::report::snapshot::ChainFacts;
+use ros2probe_model::report::snapshot::{ChainFacts, Snapshot};
 use ros2probe_wire::DomainId;
 use serde::Deserialize;
 use utoipa::IntoParams;
@@ -59,7 +59,15 @@ async fn list(
         context.latest.request_calls();
     }
     let state = context.state().await;
-    let snapshot = state.known();
+    Ok(Json(answer(state.known(), only, &ends)).into_response())
+}
+
+/// Returns the answer with all chains.
+pub(super) fn all(snapshot: &Snapshot) -> ChainList<'_> {
+    answer(snapshot, None, &Ends::default())
+}
+
+fn answer<'a>(snapshot: &'a Snapshot, only: Option<DomainId>, ends: &Ends) -> ChainList<'a> {
     let is_meant = |domain_id: DomainId| only.is_none_or(|only| only == domain_id);
     let meant = snapshot.chains.chains.iter();
     let meant = meant.filter(|facts| is_meant(facts.path.domain_id));
@@ -70,12 +78,11 @@ async fn list(
             && named(&ends.from, &each.chain.from)
             && named(&ends.to, &each.chain.to)
     });
-    let answer = ChainList {
+    ChainList {
         timestamp_seconds: snapshot.time().seconds(),
         chains,
         expected: configured.map(expected).collect(),
-    };
-    Ok(Json(answer).into_response())
+    }
 }
 
 /// Returns the API representation of chains, cut at the topics with the ROS names `from` and `to`.

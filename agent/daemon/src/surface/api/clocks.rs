@@ -11,7 +11,7 @@ use utoipa_axum::routes;
 use super::Context;
 use ros2probe_api::clocks::{ClockOffset, Clocks, PeerClock};
 use ros2probe_model::derive::clocks::{THIS_HOST, seconds};
-use ros2probe_model::report::snapshot;
+use ros2probe_model::report::snapshot::{self, Snapshot};
 
 pub(super) fn routes() -> OpenApiRouter<Context> {
     OpenApiRouter::new().routes(routes!(clocks))
@@ -29,14 +29,17 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
 )]
 async fn clocks(State(context): State<Context>) -> Response {
     let state = context.state().await;
-    let snapshot = state.known();
-    let answer = Clocks {
+    Json(answer(state.known())).into_response()
+}
+
+/// Returns the answer.
+pub(super) fn answer(snapshot: &Snapshot) -> Clocks<'_> {
+    Clocks {
         timestamp_seconds: snapshot.time().seconds(),
         is_on: snapshot.clocks.are_compared,
         peers: snapshot.clocks.peers.iter().map(peer).collect(),
         offsets: snapshot.clocks.offsets.iter().map(offset).collect(),
-    };
-    Json(answer).into_response()
+    }
 }
 
 fn peer(clock: &snapshot::PeerClock) -> PeerClock<'_> {

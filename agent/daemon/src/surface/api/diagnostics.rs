@@ -16,7 +16,7 @@ use super::problem::{Problem, ProblemBody};
 use super::scope::Domain;
 use ros2probe_api::diagnostics::{DiagnosticStatus, DiagnosticValue, Diagnostics};
 use ros2probe_model::facts::wall_clock::WallClock;
-use ros2probe_model::report::snapshot;
+use ros2probe_model::report::snapshot::{self, Snapshot};
 use ros2probe_wire::diagnostics::DiagnosticLevel;
 
 /// The query of `/diagnostics`.
@@ -64,19 +64,27 @@ async fn diagnostics(
         Some(name) => labelled("level", name, &DiagnosticLevel::ALL, DiagnosticLevel::label)?,
     };
     let state = context.state().await;
-    let snapshot = state.known();
     let is_of_topic = |topic: &str| of.topic.as_deref().is_none_or(|wanted| wanted == topic);
-    let statuses = snapshot.diagnostics.statuses.iter().filter(|status| {
+    let answer = answer(state.known(), |status| {
         domain.admits(status.domain_id) && is_of_topic(&status.topic) && status.level >= least
     });
-    let answer = Diagnostics {
+    Ok(Json(answer).into_response())
+}
+
+/// Returns the answer with the wanted statuses.
+pub(super) fn answer(
+    snapshot: &Snapshot,
+    is_wanted: impl Fn(&snapshot::DiagnosticStatus) -> bool,
+) -> Diagnostics<'_> {
+    let statuses = snapshot.diagnostics.statuses.iter();
+    let statuses = statuses.filter(|status| is_wanted(status));
+    Diagnostics {
         timestamp_seconds: snapshot.time().seconds(),
         is_on: snapshot.diagnostics.are_read,
         statuses: statuses
             .map(|status| view(status, snapshot.wall_clock))
             .collect(),
-    };
-    Ok(Json(answer).into_response())
+    }
 }
 
 fn view(status: &snapshot::DiagnosticStatus, clock: WallClock) -> DiagnosticStatus<'_> {

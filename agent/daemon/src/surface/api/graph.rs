@@ -50,7 +50,8 @@ async fn show(
     Ok(Json(graph(snapshot, scope)).into_response())
 }
 
-fn graph(snapshot: &Snapshot, scope: Scope) -> Graph {
+/// Returns the answer with the graph of a scope.
+pub(super) fn graph(snapshot: &Snapshot, scope: Scope) -> Graph {
     let mut drawing = GraphBuilder::default();
     for node in &snapshot.nodes {
         let is_hidden = node.name.split('/').any(|token| token.starts_with('_'));

@@ -35,6 +35,11 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
     responses((status = 200, description = "The state of the agent, even if it is not ready.", body = Health))
 )]
 async fn health(State(context): State<Context>) -> Json<Health> {
+    Json(answer(&context))
+}
+
+/// Returns the answer.
+pub(super) fn answer(context: &Context) -> Health {
     let state = context.latest.state();
     let instant = Instant::now();
     let ready = state.ready(instant);
@@ -52,7 +57,7 @@ async fn health(State(context): State<Context>) -> Json<Health> {
         capabilities: thread.capabilities,
         filtered: thread.filtered,
     });
-    Json(Health {
+    Health {
         ready: ready.is_ok(),
         reason: ready.err().map(|reason| reason.to_string()),
         degraded: context.limits.degraded(&state),
@@ -116,7 +121,7 @@ async fn health(State(context): State<Context>) -> Json<Health> {
         zenoh: snapshot.and_then(|snapshot| snapshot.zenoh.as_ref().map(zenoh)),
         process_id: std::process::id(),
         uptime_seconds: started.map(|started| (now.as_secs_f64() - started).max(0.0)),
-    })
+    }
 }
 
 fn zenoh(facts: &ZenohFacts) -> health::Zenoh {

@@ -17,7 +17,8 @@ use super::scope::Domain;
 use ros2probe_api::logs::{LevelLog, LogMessage, Logs, NodeLog};
 use ros2probe_model::facts::tables::LogMessages;
 use ros2probe_model::facts::wall_clock::WallClock;
-use ros2probe_model::report::snapshot::{self, NodeLogFacts};
+use ros2probe_model::report::snapshot::{self, NodeLogFacts, Snapshot};
+use ros2probe_wire::DomainId;
 use ros2probe_wire::log::LogLevel;
 
 /// Number of messages in an answer by default, and at most.
@@ -79,27 +80,41 @@ async fn logs(
         return Err(Problem::new(Code::InvalidRequest, detail));
     }
     let state = context.state().await;
-    let snapshot = state.known();
+    let is_wanted = |domain_id, name: &str| {
+        domain.admits(domain_id) && of.node.as_deref().is_none_or(|wanted| wanted == name)
+    };
+    Ok(Json(answer(state.known(), limit, least, is_wanted)).into_response())
+}
+
+/// Returns the answer with all messages that the agent keeps.
+pub(super) fn all(snapshot: &Snapshot) -> Logs<'_> {
+    answer(snapshot, MAX_LIMIT, LogLevel::Debug, |_, _| true)
+}
+
+/// Returns the answer with the latest messages of the wanted nodes and of this level.
+fn answer(
+    snapshot: &Snapshot,
+    limit: usize,
+    least: LogLevel,
+    is_wanted: impl Fn(DomainId, &str) -> bool,
+) -> Logs<'_> {
     let clock = snapshot.wall_clock;
-    let is_wanted = |name: &str| of.node.as_deref().is_none_or(|wanted| wanted == name);
     let nodes = snapshot.logs.nodes.iter();
-    let nodes = nodes.filter(|log| domain.admits(log.domain_id) && is_wanted(&log.node));
+    let nodes = nodes.filter(|log| is_wanted(log.domain_id, &log.node));
     let latest = snapshot.logs.latest.iter().rev();
-    let messages = latest.filter(|message| {
-        domain.admits(message.domain_id) && is_wanted(&message.node) && message.level >= least
-    });
+    let messages = latest
+        .filter(|message| is_wanted(message.domain_id, &message.node) && message.level >= least);
     let mut messages: Vec<_> = messages
         .take(limit)
         .map(|message| view(message, clock))
         .collect();
     messages.reverse();
-    let answer = Logs {
+    Logs {
         timestamp_seconds: snapshot.time().seconds(),
         is_on: snapshot.logs.are_read,
         nodes: nodes.map(|log| node(log, clock)).collect(),
         messages,
-    };
-    Ok(Json(answer).into_response())
+    }
 }
 
 fn node(log: &NodeLogFacts, clock: WallClock) -> NodeLog<'_> {

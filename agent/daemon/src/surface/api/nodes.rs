@@ -53,7 +53,11 @@ async fn list(
 ) -> Result<Response, Problem> {
     let scope = scope.checked()?;
     let state = context.state().await;
-    let snapshot = state.known();
+    Ok(Json(answer(state.known(), scope)).into_response())
+}
+
+/// Returns the answer with the nodes of a scope.
+pub(super) fn answer(snapshot: &Snapshot, scope: Scope) -> NodeList<'_> {
     let answers = NodeAnswers::new(snapshot, scope);
     let nodes = nodes(snapshot).filter(|nodes| {
         let first = nodes.first();
@@ -61,11 +65,10 @@ async fn list(
             scope.includes(node.domain_id) && (scope.shows_hidden() || !is_hidden(&node.name))
         })
     });
-    let answer = NodeList {
+    NodeList {
         timestamp_seconds: snapshot.time().seconds(),
         nodes: nodes.filter_map(|nodes| answers.node(nodes)).collect(),
-    };
-    Ok(Json(answer).into_response())
+    }
 }
 
 /// One node

@@ -46,8 +46,12 @@ const COMMON_ERRORS: [(&str, &str); 6] = [
         super::messages::definition,
         super::messages::follow
     ),
-    // utoipa does not collect the schema of a type parameter.
-    components(schemas(ProblemBody, super::messages::MessageLine)),
+    // utoipa does not collect the schema of a type parameter, nor that of a path parameter.
+    components(schemas(
+        ProblemBody,
+        super::messages::MessageLine,
+        ros2probe_api::history::KeptNoun
+    )),
     tags(
         (name = "watch", description = "Watches, changed while the agent runs."),
         (name = "events", description = "Events as they occur."),

@@ -43,12 +43,16 @@ async fn list(
 ) -> Result<Response, Problem> {
     let domain = domain.checked()?;
     let state = context.state().await;
-    let snapshot = state.known();
+    Ok(Json(answer(state.known(), domain)).into_response())
+}
+
+/// Returns the answer with the participants of a domain.
+pub(super) fn answer(snapshot: &Snapshot, domain: Domain) -> ParticipantList<'_> {
     let (counts, clock) = (counts(snapshot), snapshot.wall_clock);
     let participants = snapshot.participants.iter();
     let participants = participants.filter(|each| domain.admits(each.domain_id));
     let unknown_writers = snapshot.unknown_writers.iter();
-    let answer = ParticipantList {
+    ParticipantList {
         timestamp_seconds: snapshot.time().seconds(),
         participants: participants
             .map(|each| view(each, &counts, clock))
@@ -57,8 +61,7 @@ async fn list(
             .map(|each| unknown_writer(each, clock))
             .collect(),
         links: snapshot.links.iter().map(link).collect(),
-    };
-    Ok(Json(answer).into_response())
+    }
 }
 
 fn link(facts: &LinkFacts) -> Link<'static> {

@@ -16,7 +16,8 @@ use super::problem::{Problem, ProblemBody};
 use super::scope::Domain;
 use ros2probe_api::parameters as api;
 use ros2probe_model::facts::wall_clock::WallClock;
-use ros2probe_model::report::snapshot;
+use ros2probe_model::report::snapshot::{self, Snapshot};
+use ros2probe_wire::DomainId;
 
 /// The query of `/parameters`.
 #[derive(Clone, Debug, Default, Deserialize, IntoParams)]
@@ -57,20 +58,28 @@ async fn parameters(
 ) -> Result<Response, Problem> {
     let domain = Domain::of(of.domain_id).checked()?;
     let state = context.state().await;
-    let snapshot = state.known();
+    let answer = answer(state.known(), |domain_id, node| {
+        domain.admits(domain_id) && of.node.as_deref().is_none_or(|wanted| wanted == node)
+    });
+    Ok(Json(answer).into_response())
+}
+
+/// Returns the answer with the parameters of the wanted nodes.
+pub(super) fn answer(
+    snapshot: &Snapshot,
+    is_wanted: impl Fn(DomainId, &str) -> bool,
+) -> api::Parameters<'_> {
     let clock = snapshot.wall_clock;
-    let is_of_node = |node: &str| of.node.as_deref().is_none_or(|wanted| wanted == node);
     let known = snapshot.parameters.known.iter();
-    let known = known.filter(|each| domain.admits(each.domain_id) && is_of_node(&each.node));
+    let known = known.filter(|each| is_wanted(each.domain_id, &each.node));
     let changes = snapshot.parameters.changes.iter();
-    let changes = changes.filter(|each| domain.admits(each.domain_id) && is_of_node(&each.node));
-    let answer = api::Parameters {
+    let changes = changes.filter(|each| is_wanted(each.domain_id, &each.node));
+    api::Parameters {
         timestamp_seconds: snapshot.time().seconds(),
         is_on: snapshot.parameters.are_read,
         parameters: known.map(|parameter| view(parameter, clock)).collect(),
         changes: changes.map(|change| changed(change, clock)).collect(),
-    };
-    Ok(Json(answer).into_response())
+    }
 }
 
 fn view(parameter: &snapshot::ParameterFacts, clock: WallClock) -> api::Parameter<'_> {

@@ -32,6 +32,12 @@ pub(super) struct Domain {
 }
 
 impl Scope {
+    /// The scope with every domain and hidden names.
+    pub(super) const EVERYTHING: Self = Self {
+        domain_id: None,
+        hidden: Some(true),
+    };
+
     /// # Errors
     /// Fails if the domain id is invalid.
     pub(super) fn checked(self) -> Result<Self, Problem> {

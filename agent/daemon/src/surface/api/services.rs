@@ -48,9 +48,13 @@ async fn list(
 ) -> Result<Response, Problem> {
     let scope = scope.checked()?;
     let state = context.state().await;
-    let snapshot = state.known();
+    Ok(Json(answer(state.known(), scope)).into_response())
+}
+
+/// Returns the answer with the services of a scope.
+pub(super) fn answer(snapshot: &Snapshot, scope: Scope) -> ServiceList<'_> {
     let (index, clock) = (Index::new(snapshot), snapshot.wall_clock);
-    let answer = ServiceList {
+    ServiceList {
         timestamp_seconds: snapshot.time().seconds(),
         services: services(snapshot, scope)
             .into_iter()
@@ -63,8 +67,7 @@ async fn list(
                 ))
             })
             .collect(),
-    };
-    Ok(Json(answer).into_response())
+    }
 }
 
 /// Groups services by domain and name.

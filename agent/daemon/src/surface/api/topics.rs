@@ -32,7 +32,7 @@ use crate::snapshot_cell::State as AgentState;
 use crate::watches::ActiveWatches;
 use ros2probe_api::endpoints::WriterClock;
 use ros2probe_api::topics::{
-    self, Acknowledgement, Delivery, Topic, TopicDetails, TopicList, Watching,
+    self, Acknowledgement, Delivery, Topic, TopicDetails, TopicDetailsList, TopicList, Watching,
 };
 use ros2probe_model::derive::clocks::{PeerClock, seconds};
 use ros2probe_model::facts::topic_kind::TopicKind;
@@ -77,6 +77,22 @@ async fn list(
         topics: topics.map(|topic| answers.topic(topic)).collect(),
     };
     Ok(Json(answer).into_response())
+}
+
+/// Returns the answer with the details of all topics, without the figures that change all the time
+/// and that the history has.
+pub(super) fn details_without_figures<'a>(
+    state: &'a AgentState,
+    in_force: &'a ActiveWatches,
+) -> TopicDetailsList<'a> {
+    let answers = TopicAnswers::new(state, in_force);
+    let topics = answers.snapshot.topics.iter();
+    TopicDetailsList {
+        timestamp_seconds: answers.snapshot.time().seconds(),
+        topics: topics
+            .map(|topic| answers.details(topic).without_figures())
+            .collect(),
+    }
 }
 
 /// One topic

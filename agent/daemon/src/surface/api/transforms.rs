@@ -16,7 +16,7 @@ use super::problem::{Problem, ProblemBody};
 use super::scope::Domain;
 use ros2probe_api::transforms::{Broadcaster, TransformEdge, TransformTree, Transforms};
 use ros2probe_model::facts::wall_clock::WallClock;
-use ros2probe_model::report::snapshot::{EdgeFacts, TreeFacts};
+use ros2probe_model::report::snapshot::{EdgeFacts, Snapshot, TreeFacts};
 
 /// The query of `/transforms`.
 #[derive(Clone, Debug, Default, Deserialize, IntoParams)]
@@ -53,15 +53,18 @@ async fn transforms(
 ) -> Result<Response, Problem> {
     let domain = Domain::of(of.domain_id).checked()?;
     let state = context.state().await;
-    let snapshot = state.known();
+    Ok(Json(answer(state.known(), domain)).into_response())
+}
+
+/// Returns the answer with the trees of a domain.
+pub(super) fn answer(snapshot: &Snapshot, domain: Domain) -> Transforms<'_> {
     let trees = snapshot.transforms.trees.iter();
     let trees = trees.filter(|tree| domain.admits(tree.domain_id));
-    let answer = Transforms {
+    Transforms {
         timestamp_seconds: snapshot.time().seconds(),
         is_on: snapshot.transforms.are_read,
         trees: trees.map(|tree| view(tree, snapshot.wall_clock)).collect(),
-    };
-    Ok(Json(answer).into_response())
+    }
 }
 
 fn view(tree: &TreeFacts, clock: WallClock) -> TransformTree<'_> {

@@ -1,5 +1,6 @@
 //! `/history`: what the agent keeps on disk of the last days, and the robot as it was at a moment.
 
+mod answers;
 mod event_range;
 mod latest;
 mod query;
@@ -11,22 +12,24 @@ mod writer;
 
 use std::sync::Arc;
 
-use axum::Json;
-use axum::extract::State;
+use axum::extract::{Path, State};
 use axum::http::HeaderValue;
+use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE};
 use axum::response::Response;
+use axum::{Extension, Json};
 use serde::Deserialize;
 use utoipa::IntoParams;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::body_stream::lines_of;
-use super::parameters::Parameters;
+use super::parameters::{Parameters, labelled};
 use super::problem::{Code, Problem, ProblemBody};
+use super::security::Rights;
 use super::{Context, in_turn};
 use latest::{LatestEvents, LatestProcesses};
 use ros2probe_api::history::{
-    DiskHistory, HistorySpan, ProcessColumns, ProcessHistory, TRUNCATED_HEADER,
+    DiskHistory, HistorySpan, KeptNoun, ProcessColumns, ProcessHistory, TRUNCATED_HEADER,
 };
 use ros2probe_history::{ProcessRow, Span, Store};
 
@@ -40,6 +43,7 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
     OpenApiRouter::new()
         .routes(routes!(get_history))
         .routes(routes!(get_moment))
+        .routes(routes!(get_answer))
         .routes(routes!(processes))
         .routes(routes!(events))
 }
@@ -81,6 +85,7 @@ async fn get_history(State(context): State<Context>) -> Json<DiskHistory> {
         limit_bytes: facts.limit,
         seconds: span(facts.seconds),
         tens: span(facts.tens),
+        answers: span(facts.documents),
         writes,
         failed_writes,
     })
@@ -122,6 +127,50 @@ async fn get_moment(
         )
     })?;
     Ok(in_turn(&context, async { lines_of(lines) }).await)
+}
+
+/// An answer of the API as it was
+///
+/// The answer is that of `/parameters`, `/chains` and so on without a query, with hidden names. It is
+/// the last one that was written before `at`, one a minute. Topics have the form of
+/// `/topics/{topic}`, without measurements and histograms, and with the acknowledgements of readers
+/// that lag. Parameters, diagnostics and logs need the same rights as in the present.
+#[utoipa::path(
+    get,
+    path = "/history/moment/{noun}",
+    tag = "graph",
+    params(("noun" = KeptNoun, Path, description = "The noun."), MomentQuery),
+    responses(
+        (status = 200, description = "The answer of that time.",
+            body = answers::KeptAnswer<'static>),
+        (status = 403, description = "The listener does not grant this answer.",
+            body = ProblemBody, content_type = "application/problem+json"),
+        (status = 404, description = "No such answer of that time is kept.",
+            body = ProblemBody, content_type = "application/problem+json"),
+        (status = 422, description = "The noun or the time is invalid.",
+            body = ProblemBody, content_type = "application/problem+json"),
+    )
+)]
+async fn get_answer(
+    State(context): State<Context>,
+    Extension(granted): Extension<Rights>,
+    Path(noun): Path<String>,
+    Parameters(moment): Parameters<MomentQuery>,
+) -> Result<Response, Problem> {
+    let noun = labelled("noun", &noun, &KeptNoun::ALL, KeptNoun::label)?;
+    granted.require(answers::required_rights(noun))?;
+    let at = query::second(moment.at)?;
+    let read = read_store(&context, move |store| store.document(noun.label(), at));
+    let (version, _permit) = read.await?;
+    let version = version.ok_or_else(|| {
+        let detail = format!("no answer of /{} of that time is kept", noun.label());
+        Problem::new(Code::NoHistory, detail)
+    })?;
+    let headers = [
+        (CACHE_CONTROL, "no-store"),
+        (CONTENT_TYPE, "application/json"),
+    ];
+    Ok(in_turn(&context, async { (headers, version.content) }).await)
 }
 
 /// CPU time and memory of the robot's processes

@@ -3,16 +3,19 @@
 use std::path::Path;
 
 use axum::Extension;
-use axum::body::Body;
+use axum::body::{Body, to_bytes};
 use axum::http::{Request, StatusCode, Uri};
 use hyper::service::Service as _;
 use hyper_util::service::TowerToHyperService;
 use ros2probe_api::doctor::{Report, Severity};
+use ros2probe_api::history::KeptNoun;
+use ros2probe_api::topics::TopicDetailsList;
 use ros2probe_capture::reassembly::Limits;
 use ros2probe_testing::repository;
 
 use super::super::security::Rights;
 use super::super::{Context, Doctor, nouns};
+use super::answers;
 use super::query::{MAX_READERS, READER_PERMITS};
 use crate::agent::{Components, Expansion, Speed};
 use crate::agent_facts::SourceKind;
@@ -60,6 +63,7 @@ async fn a_storage_that_does_not_answer_delays_no_other_answer() {
         "/history/events?from=1&to=2",
         "/history/processes?from=1&to=2",
         "/history/moment?at=5",
+        "/history/moment/parameters?at=5",
         "/topics/imu/history?from=1&to=2",
     ];
     let waiting = waiting.map(|path| tokio::spawn(ask(path)));
@@ -75,5 +79,58 @@ async fn a_storage_that_does_not_answer_delays_no_other_answer() {
     for request in waiting {
         let answer = request.await.unwrap().unwrap();
         assert_eq!(answer.status(), StatusCode::NOT_FOUND);
+    }
+}
+
+/// Requests a path with these rights. Returns the status, and the body.
+async fn ask(context: &Context, access: Access, path: &str) -> (StatusCode, Vec<u8>) {
+    let (router, _) = nouns(Some(context)).split_for_parts();
+    let router = router
+        .layer(Extension(Rights::new(access, None)))
+        .with_state(context.clone());
+    let mut request = Request::new(Body::empty());
+    *request.uri_mut() = path.parse().unwrap();
+    let answer = TowerToHyperService::new(router)
+        .call(request)
+        .await
+        .unwrap();
+    let status = answer.status();
+    let body = to_bytes(answer.into_body(), usize::MAX).await.unwrap();
+    (status, body.to_vec())
+}
+
+#[tokio::test]
+async fn an_answer_of_the_past_is_found_after_a_restart_by_clients_with_its_rights() {
+    let directory = tempfile::tempdir().unwrap();
+    let before = context(directory.path());
+    assert!(before.disk_history.open());
+    let store = before.disk_history.store().unwrap();
+    store
+        .append_documents(0, 60, answers::present(&before))
+        .unwrap();
+    drop(before);
+
+    let context = context(directory.path());
+    assert!(context.disk_history.open());
+    for noun in KeptNoun::ALL {
+        let path = format!("/history/moment/{}?at=61", noun.label());
+        let (status, body) = ask(&context, Access::All, &path).await;
+        assert_eq!(status, StatusCode::OK, "{path}");
+        let answer: serde_json::Value = serde_json::from_slice(&body).unwrap();
+        assert!(answer.is_object(), "{path}");
+        // The same rights as in the present.
+        let present = format!("/{}", noun.label());
+        let (now, _) = ask(&context, Access::Read, &present).await;
+        let (then, _) = ask(&context, Access::Read, &path).await;
+        assert_eq!(then, now, "{path}");
+        let path = format!("/history/moment/{}?at=59", noun.label());
+        let (status, _) = ask(&context, Access::All, &path).await;
+        assert_eq!(status, StatusCode::NOT_FOUND, "{path}");
+    }
+    let (_, topics) = ask(&context, Access::Read, "/history/moment/topics?at=61").await;
+    serde_json::from_slice::<TopicDetailsList<'_>>(&topics).unwrap();
+    for path in ["/history/moment/doctor?at=61", "/history/moment/logs?at=-1"] {
+        let (status, _) = ask(&context, Access::All, path).await;
+        assert_eq!(status, StatusCode::UNPROCESSABLE_ENTITY, "{path}");
     }
 }

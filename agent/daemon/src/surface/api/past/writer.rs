@@ -21,6 +21,7 @@ use super::super::body_stream::write_line;
 use super::super::events::event;
 use super::super::processes::{MAX_PROCESSES, local};
 use super::super::{Context, live};
+use super::answers;
 use crate::events::Reader;
 use crate::state::{END_TIMEOUT, join_until};
 use crate::surface::process::{Usage, script};
@@ -253,7 +254,8 @@ impl Minute {
         if let Some(last) = last {
             (self.written, self.written_end) = (now, last.end);
         }
-        let written = append(store, &blocks, now);
+        let written = append(store, blocks, now)
+            .and_then(|()| store.append_documents(begin, now, answers::present(&self.context)));
         history.count(&written);
         let failed_before = std::mem::replace(&mut self.is_failing, written.is_err());
         match written {
@@ -290,8 +292,10 @@ impl EventLines {
     }
 }
 
-fn append(store: &Store, blocks: &[Block], now: u32) -> io::Result<()> {
-    store.append(Tier::Seconds, blocks)?;
+fn append(store: &Store, blocks: Vec<Block>, now: u32) -> io::Result<()> {
+    store.append(Tier::Seconds, &blocks)?;
+    // A merge and documents need memory, too.
+    drop(blocks);
     store.condense(now)
 }
 
