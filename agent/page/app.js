@@ -33,8 +33,11 @@ const VIEWS = [
   ['recordings', 'Recordings', 'r'], ['agent', 'Agent', 'a'],
 ];
 
-/** Views whose figures the history does not have. */
-const PRESENT_ONLY = ['chains', 'robot', 'recordings', 'agent', 'doctor'];
+/** Views that have no past, and why. */
+const PRESENT_ONLY = /** @type {Record<string, [string, string]>} */ ({
+  recordings: ['Recordings', 'Bags are those that the robot has at present.'],
+  doctor: ['Doctor', 'The doctor examines the host as it is at present.'],
+});
 
 function takeToken() {
   const given = tokenOf(location.hash);
@@ -163,10 +166,8 @@ function reveal(main, id) {
 /** @param {{route: import('./router.js').Route|null}} props */
 function View({ route }) {
   const query = route?.query ?? {};
-  if (stream.at != null && PRESENT_ONLY.includes(route?.view ?? '')) {
-    const [, title] = VIEWS.find(([view]) => view === route?.view) ?? ['', 'Doctor'];
-    return html`<${PresentOnly} title=${title} />`;
-  }
+  const presentOnly = stream.at == null ? null : PRESENT_ONLY[route?.view ?? ''];
+  if (presentOnly) return html`<${PresentOnly} title=${presentOnly[0]} why=${presentOnly[1]} />`;
   switch (route?.view) {
     case '': return html`<${Overview} />`;
     case 'topics': return route.name == null

@@ -3,7 +3,7 @@
 import { count, duration, groupOf, lastMessage, rate } from './format.js';
 import { address } from './router.js';
 import { html, Mark, Name } from './ui.js';
-import { state } from './store.js';
+import { state, stream } from './store.js';
 
 /** Most endpoints side by side; those of incompatible pairs come first. */
 const MOST_COLUMNS = 8;
@@ -34,6 +34,8 @@ function Owner({ endpoint }) {
 export function Endpoints({ details, topic }) {
   const hasBuffers = [...details.publishers, ...details.subscriptions].some(
     (/** @type {any} */ each) => each.backends.length);
+  // The history has rates of topics, not of publishers.
+  const hasRates = stream.at == null;
   const latches = details.publishers.some((/** @type {any} */ each) => each.latched);
   const row = (/** @type {any} */ endpoint, /** @type {boolean} */ publishes) => {
     const own = (publishes ? topic.publishers : topic.subscriptions)
@@ -45,7 +47,7 @@ export function Endpoints({ details, topic }) {
       <td>${endpoint.vendor ?? ''}</td>
       <td><${Name} text=${endpoint.message_type} /></td>
       ${hasBuffers && html`<td><${Name} text=${endpoint.backends.join(', ')} /></td>`}
-      ${publishes && html`<td class="number">${rate(endpoint.measurement?.rate_hertz)}</td>`}
+      ${publishes && hasRates && html`<td class="number">${rate(endpoint.measurement?.rate_hertz)}</td>`}
       ${publishes && latches && html`<td>${endpoint.latched && lastMessage(endpoint.latched)}</td>`}
       <td><${Name} text=${endpoint.guid} /></td></tr>`;
   };
@@ -56,7 +58,7 @@ export function Endpoints({ details, topic }) {
     <thead><tr><th scope="col">Node</th><th scope="col">Where</th>
       <th scope="col">Implementation</th><th scope="col">Type</th>
       ${hasBuffers && html`<th scope="col">Buffers in</th>`}
-      ${publishes && html`<th scope="col" class="number">Rate</th>`}
+      ${publishes && hasRates && html`<th scope="col" class="number">Rate</th>`}
       ${publishes && latches && html`<th scope="col">Last message</th>`}
       <th scope="col">GUID</th></tr></thead>
     <tbody>${list.map((endpoint) => row(endpoint, publishes))}</tbody></table></div>`;

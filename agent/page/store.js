@@ -2,6 +2,7 @@
 
 import { useEffect, useReducer, useRef, useState } from './vendor/hooks.mjs';
 import { json, Refusal } from './api.js';
+import { pastOf } from './past.js';
 import { keepTime, parse } from './router.js';
 import { State } from './state.js';
 import { Stream } from './stream.js';
@@ -124,13 +125,18 @@ export function useRequest(path, part, every, ask, may) {
 }
 
 /**
- * Requests an endpoint periodically. It has the present, so a moment in the past needs no request.
+ * Requests an endpoint periodically. For a moment in the past it requests once what the history kept of
+ * that time, and nothing if that is not kept.
  * @param {string|null} path null sends no request
  * @param {number} every milliseconds; 0 sends one request
  */
 export function usePoll(path, every) {
-  return useRequest(stream.at == null ? path : null, '', every, (signal) => json(String(path), { signal }),
-    () => stream.status !== 'paused');
+  const { at } = stream;
+  const past = path != null && at != null ? pastOf(path, at) : null;
+  const key = at == null ? path : past && `${path} at ${at}`;
+  return useRequest(key, '', at == null ? every : 0, async (signal) =>
+    (past ? past.part(await json(past.path, { signal })) : json(String(path), { signal })),
+  () => stream.status !== 'paused');
 }
 
 /**

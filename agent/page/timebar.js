@@ -229,9 +229,9 @@ function Replay() {
     ${problem && html`<span class="problem" role="alert">${problem}</span>`}</section>`;
 }
 
-/** What a view without a history shows in place of a moment in the past. @param {{title: string}} props */
-export function PresentOnly({ title }) {
-  return html`<h1 tabindex="-1">${title}</h1><p>This view has no history. <button type="button"
+/** What a view without a history shows in place of a moment in the past. @param {{title: string, why: string}} props */
+export function PresentOnly({ title, why }) {
+  return html`<h1 tabindex="-1">${title}</h1><p>${why} This view has no history. <button type="button"
     onClick=${() => showTime({ at: null })}>Show the present</button> or look at the${' '}
     <a href=${address('')}>overview</a> of that time.</p>`;
 }

@@ -29,7 +29,7 @@ impl File {
 }
 
 /// Every file, by its path below `/page/`; `index.html` is also served at `/`.
-pub static FILES: [File; 44] = [
+pub static FILES: [File; 45] = [
     File::new("api.js", SCRIPT_TYPE, include_bytes!("../api.js")),
     File::new("app.css", CSS_TYPE, include_bytes!("../app.css")),
     File::new("app.js", SCRIPT_TYPE, include_bytes!("../app.js")),
@@ -54,6 +54,7 @@ pub static FILES: [File; 44] = [
     ),
     File::new("layout.js", SCRIPT_TYPE, include_bytes!("../layout.js")),
     File::new("message.js", SCRIPT_TYPE, include_bytes!("../message.js")),
+    File::new("past.js", SCRIPT_TYPE, include_bytes!("../past.js")),
     File::new("preview.js", SCRIPT_TYPE, include_bytes!("../preview.js")),
     File::new("qos.js", SCRIPT_TYPE, include_bytes!("../qos.js")),
     File::new("router.js", SCRIPT_TYPE, include_bytes!("../router.js")),

@@ -45,14 +45,14 @@ export function Agent() {
       ['Version', open.version ?? '–'],
       ['Looks at', html`${SOURCES[open.source] ?? open.source ?? '–'} ${data?.source_reason
         ? html`<span class="dim"><${Name} text=${data.source_reason} /></span>` : ''}`],
-      ['Rights at this address', html`${open.access ?? '–'} ${open.access !== 'all'
-        && html`<${AskButton} />`}`],
+      ...(stream.at == null ? [['Rights at this address', html`${open.access ?? '–'} ${open.access !== 'all'
+        && html`<${AskButton} />`}`]] : []),
       ['Running for', duration(data?.uptime_seconds)],
       ['Process', data?.process_id ?? '–'],
       ['Capabilities', html`<${Name} text=${data?.capabilities.join(', ') || 'none'} />`],
       ['Watches', html`${count(data?.watches)} <a href=${address('topics', null,
         { only: 'measured' })}>measured topics</a>`],
-      ['Stream', stream.status],
+      ...(stream.at == null ? [['Stream', stream.status]] : []),
       ...(data?.zenoh ? [['Zenoh', `${count(data.zenoh.connections)} connections, ${
         count(data.zenoh.routers)} routers`]] : []),
     ]} />

@@ -1,10 +1,10 @@
 // Chains of messages through nodes: a list, and a waterfall of the hops of one.
 
 import { chainAddress, chainsThrough, chosen, graphWords, lateCallsAddress, NO_CHAIN, partsOf,
-  rowsOf, slowest, tickText, topicsOf, waterfall, wayOf } from '../chains.js';
+  rowsOf, section, slowest, tickText, topicsOf, waterfall, wayOf } from '../chains.js';
 import { count, duration, several, shortened, visible, when } from '../format.js';
 import { address } from '../router.js';
-import { replaceAddress, state, useLive, usePoll } from '../store.js';
+import { replaceAddress, state, stream, useLive, usePoll } from '../store.js';
 import { sorted, Table } from '../table.js';
 import { Failed, Figure, Filter, html, Mark, matches, Name } from '../ui.js';
 import { useState } from '../vendor/hooks.mjs';
@@ -115,6 +115,7 @@ export function Chains({ query }) {
 
 /** Names what makes chains appear. */
 function NoChain() {
+  if (stream.at != null) return html`<p class="empty">No chain was known at that time.</p>`;
   const measured = [...state.topics.values()].filter((topic) => topic.measured).length;
   return html`<div class="empty"><p>No chain has been found. A chain appears after 5 messages, if:</p>
     <ul><li>its topics are measured (<a href=${address('topics', null, { only: 'measured' })}
@@ -132,7 +133,8 @@ export function ChainView({ from, query }) {
   const words = new URLSearchParams({
     from, ...(to && { to }), ...(domain && { domain_id: domain }) });
   const { data, problem } = usePoll(`chains?calls=true&${words}`, EVERY_MS);
-  const chain = data && chosen(data.chains, from, query);
+  // Answers of the past have whole chains only.
+  const chain = data && (stream.at == null ? chosen : section)(data.chains, from, query);
   const end = chain?.to ?? to;
   const expected = data?.expected.find((/** @type {any} */ each) => each.from === from
     && each.to === end && (!chain || (each.domain_id === chain.domain_id
@@ -151,7 +153,7 @@ export function ChainView({ from, query }) {
     <${Failed} problem=${problem} what=${data ? 'The chain is not updated' : 'No chain'} />
     ${data && !chain && html`<p class="empty">${expected
       ? 'The chain is configured, and no message has passed it so far.'
-      : 'No such chain now. It may have had no message since the agent started.'}</p>`}
+      : `No such chain ${stream.at == null ? 'now' : 'at that time'}. It may have had no message since the agent started.`}</p>`}
     ${chain && html`<div class="figures">
       <${Figure} label="end to end p50" value=${duration(chain.latency.p50_seconds)} />
       <${Figure} label="end to end p99" value=${duration(chain.latency.p99_seconds)} />
@@ -160,7 +162,8 @@ export function ChainView({ from, query }) {
       <${Figure} label="messages" value=${count(chain.messages)} />
       <${Figure} label="last message" value=${when(chain.last_seen_seconds)} /></div>
       <${Waterfall} chain=${chain} limit=${limit} />
-      <${WhyLate} key=${chainAddress(chain)} chain=${chain} />`}`;
+      ${stream.at == null ? html`<${WhyLate} key=${chainAddress(chain)} chain=${chain} />`
+        : html`<p class="dim">Late calls of its callbacks are not kept.</p>`}`}`;
 }
 
 /** Shows the late calls of a chain's callbacks on request.

@@ -2,7 +2,7 @@
 
 import { percent } from '../format.js';
 import { tables, waiting } from '../inside.js';
-import { state, usePoll } from '../store.js';
+import { state, stream, usePoll } from '../store.js';
 import { Failed, html, Name } from '../ui.js';
 import { useEffect, useState } from '../vendor/hooks.mjs';
 import { Late } from './late.js';
@@ -24,6 +24,8 @@ export function Inside({ inside, name, domain, picked = null }) {
     ? `why?name=${encodeURIComponent(name)}&domain_id=${domain}&history=true` : null, AGAIN_MS);
   const shown = inside ? tables(inside) : [];
   const isShown = shown.length > 0 || inside?.lifecycle_state;
+  const isPast = stream.at != null;
+  if (isPast && !isShown) return null;
   if (!observes && !isShown) {
     return html`<p id="inside"><button type="button" onClick=${() => observe(true)}>Observe calls</button>${' '}
       <span class="dim">Callbacks and queues inside the processes, while this view is open. Each call
@@ -44,6 +46,7 @@ export function Inside({ inside, name, domain, picked = null }) {
         ? html`<th scope="row"><${Name} text=${cell} /></th>` : at === 1
           ? html`<td><${Name} text=${state.withScripts(cell)} /></td>` : html`<td class="number">${cell}</td>`)}</tr>`)}
       </tbody></table></div>`)}
-    ${observes ? html`<${Late} answer=${late} picked=${picked} />`
+    ${isPast ? html`<p class="dim">Late calls are not kept.</p>`
+      : observes ? html`<${Late} answer=${late} picked=${picked} />`
       : html`<p><button type="button" onClick=${() => observe(true)}>Why late?</button></p>`}</section>`;
 }

@@ -31,7 +31,9 @@ function useProcesses() {
     part: /** @type {Map<number, number>} */ (new Map()) });
   const byId = new Map();
   const { data } = answer;
-  if (data) {
+  if (data && stream.at != null) {
+    for (const each of data.processes) byId.set(each.process_id, { ...each, part: each.cpu_cores });
+  } else if (data) {
     const { time, seconds, part } = before.current;
     const elapsed = data.timestamp_seconds - time;
     if (elapsed > 0.2) {
@@ -230,7 +232,7 @@ export function NodeView({ name, query }) {
   const { byId } = useProcesses();
   if (!node) {
     return html`<h1 tabindex="-1"><${Name} text=${name} /></h1>
-      <p>No such node now. <a href=${address('nodes')}>All nodes</a></p>`;
+      <p>No such node ${stream.at == null ? 'now' : state.unknown ? 'is known of that time' : 'at that time'}. <a href=${address('nodes')}>All nodes</a></p>`;
   }
   const { data } = details;
   const findings = state.findings.filter((finding) => finding.node === node.id);
@@ -272,11 +274,10 @@ export function NodeView({ name, query }) {
     })}</tbody></table></div></section>
     <${ProcessCharts} participants=${instances} />
     <${Failed} problem=${details.problem} what="No details" />
-    <p hidden=${stream.at != null}>Parameters: ${services.data
+    <p>Parameters: ${services.data
       ? known.length ? 'the node has parameter services.' : 'the node has no parameter services.'
       : '–'}</p>
-    ${stream.at == null && html`<${Inside} key=${`inside ${node.id}`} inside=${data?.inside}
-      name=${node.name} domain=${node.domain} />`}
+    <${Inside} key=${`inside ${node.id}`} inside=${data?.inside} name=${node.name} domain=${node.domain} />
     ${list('Publishers', data?.publishers, 'topics')}
     ${list('Subscriptions', data?.subscriptions, 'topics')}
     ${list('Services', data?.services, null)}

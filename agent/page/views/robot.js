@@ -4,7 +4,7 @@ import { useRef, useState } from '../vendor/hooks.mjs';
 import { Bars } from '../chart.js';
 import { age, clock, count, date, duration, rate, several, when } from '../format.js';
 import { address, clockId, frameId, nodeAddress } from '../router.js';
-import { replaceAddress, state, useLive, usePoll } from '../store.js';
+import { replaceAddress, state, stream, useLive, usePoll } from '../store.js';
 import { sorted, Table } from '../table.js';
 import { inWords, useEvents, useTime } from '../timebar.js';
 import { roots } from '../transforms.js';
@@ -46,7 +46,7 @@ export function Robot({ name, query }) {
     <nav class="parts" aria-label="What the robot says"><ul>${PARTS.map(([each, text]) => html`
       <li key=${each}><a href=${address('robot', each)}
         aria-current=${each === part ? 'page' : undefined}>${text}</a></li>`)}</ul></nav>
-    <${View} key=${part} query=${query} change=${change} />`;
+    <${View} key=${`${part} ${stream.at}`} query=${query} change=${change} />`;
 }
 
 /** Why there is nothing: the part is off, or nothing was seen. @param {any} props */

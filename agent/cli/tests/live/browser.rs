@@ -5,6 +5,7 @@
 
 mod calls;
 mod crowd;
+mod past;
 mod pipelines;
 pub(crate) mod player;
 pub(crate) mod robot;
@@ -18,6 +19,7 @@ use crate::robot_parts::{self, Node};
 use crate::rp;
 use anyhow::{Context as _, Result, ensure};
 use flate2::read::MultiGzDecoder;
+use past::unix_time;
 use player::{play, play_for, watch};
 use robot::{Place, Robot};
 use ros2probe_testing::harness::bpf::interest_of;
@@ -43,8 +45,6 @@ const CHAINS: &str = "chains:
 ";
 /// Number of nodes among which one is found.
 const NODES: usize = 200;
-/// Time for which the robot of the past runs: three readings of its processes.
-const PAST: Duration = Duration::from_secs(35);
 /// Address of the page of an agent with a network namespace of its own.
 pub(crate) const PAGE: &str = "http://127.0.0.1:17401/";
 
@@ -245,35 +245,6 @@ fn the_page_shows_logs_diagnostics_parameters_transforms_and_lifecycle() -> Resu
     while_repeating(renew, || {
         watch(&link.monitor.inside(), "robot-says", &[PAGE])
     })
-}
-
-#[test]
-fn the_page_shows_the_robot_as_it_was_before_a_restart() -> Result<()> {
-    let place = Place::new()?;
-    let state = place.directory.path().join("state");
-    std::fs::create_dir(&state)?;
-    let configuration = format!("watch: [/**]\nstate_directory: {}\n", state.display());
-    let mut agent = place.agent(&configuration)?;
-    let begin = unix_time();
-    let robot = Robot::start(&place.host)?;
-    std::thread::sleep(PAST);
-    agent.process.terminate()?;
-    let end = unix_time();
-    drop((agent, robot));
-    std::fs::remove_file(state.join("discovery.json"))?;
-    let mut running = None;
-    let mut answers = |question: &str| {
-        ensure!(question == "another robot after a restart", "{question}");
-        let agent = place.agent(&configuration)?;
-        running = Some((agent, place.publisher("/after_restart", "/other")?));
-        Ok(json!({"begin": begin, "end": end}))
-    };
-    play(&place.inside(), "past", &[PAGE], &mut answers)
-}
-
-fn unix_time() -> u64 {
-    let since = std::time::SystemTime::UNIX_EPOCH.elapsed();
-    since.unwrap_or_default().as_secs()
 }
 
 #[test]

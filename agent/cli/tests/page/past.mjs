@@ -54,7 +54,14 @@ await scenario(async (open) => {
   await page.getByRole('navigation').getByRole('link', { name: 'Nodes' }).click();
   await page.getByRole('link', { name: '/lidar', exact: true }).first().click();
   await there(page.locator('.chart').filter({ has: page.getByRole('heading', { name: 'CPU' }) }));
-  await page.getByRole('navigation').getByRole('link', { name: 'Robot' }).click();
+  // The QoS of a topic that no longer exists, CPU and services of a node, and a view without a past.
+  await page.goto(`${page.url().split('#')[0]}#/topics/%2Fimu?at=${end}&span=${end - begin}`);
+  await reads(page.locator('main'), /Quality of service[^]*offered by[^]*Reliability/);
+  await reads(page.locator('main'), /Where messages are lost[^]*Delivered/);
+  await tab.accessible('the QoS of the past');
+  await page.goto(`${page.url().split('#')[0]}#/nodes?at=${end}&span=${end - begin}`);
+  await until('its CPU', async () => /%/.test(await row('/lidar').innerText()));
+  await page.getByRole('navigation').getByRole('link', { name: 'Recordings' }).click();
   await reads(page.locator('main'), 'This view has no history');
 
   // A time without an agent.
