@@ -55,6 +55,8 @@ use crate::{
 
 /// `skb->pkt_type` of a frame that this host sends.
 const PACKET_OUTGOING: u32 = 4;
+/// As [`PACKET_OUTGOING`], for a copy of a sent multicast packet.
+const PACKET_LOOPBACK: u32 = 5;
 /// Index of the loopback device in every network namespace.
 const LOOPBACK: u32 = 1;
 /// Return value at tcx: the next program decides, or the kernel after the last one.
@@ -81,7 +83,12 @@ pub fn wire(context: SkBuffContext) -> i64 {
 /// continues as without the program.
 #[classifier]
 pub fn tcx_ingress(context: TcContext) -> i32 {
-    tcx::process_packet(context.skb.skb, hook::TCX_INGRESS);
+    let skb = context.skb.skb;
+    // A sent multicast packet comes back for the members on this host, and was counted when sent.
+    // SAFETY: the verifier rewrites reads of this field.
+    if unsafe { (*skb).pkt_type } != PACKET_LOOPBACK {
+        tcx::process_packet(skb, hook::TCX_INGRESS);
+    }
     TCX_NEXT
 }
 

@@ -36,8 +36,9 @@ pub mod hook {
 const FROM_IP_HEADER: u32 = 1;
 /// Result of [`link_header_len`] if the length is unknown.
 pub const NO_LINK_HEADER: u32 = u32::MAX;
-/// Length of an Ethernet header.
+/// Lengths of an Ethernet header, and of a VLAN tag.
 const ETHERNET_LEN: u32 = 14;
+const TAG_LEN: u32 = 4;
 
 const UDP: u32 = 17;
 /// Third word of an IPv4-mapped address, in memory order.
@@ -116,16 +117,30 @@ pub fn is_fragment(slot: u32) -> Option<bool> {
     Some(scratch(slot)?.get().packet.is_fragment != 0)
 }
 
-/// Reads the first 20 bytes of the IP header of a packet at tcx. Unlike [`load_bytes`], it reads
-/// only the contiguous part of a packet, which begins with the headers.
+/// Reads the first 20 bytes of the IP header of a packet at tcx; `at` is one of [`hook`].
 #[inline(always)]
-pub fn load_ip_header(skb: *mut __sk_buff) -> Option<[u32; 5]> {
+pub fn load_ip_header(skb: *mut __sk_buff, at: u32) -> Option<[u32; 5]> {
+    let tag = if at == hook::TCX_INGRESS {
+        ip_header_offset(skb)
+    } else {
+        0
+    };
+    match load_contiguous_ip_header(skb, tag) {
+        Some(header) => Some(header),
+        // Some drivers leave all that follows the header of Ethernet in pages.
+        None => load_with_helper(skb, ETHERNET_LEN),
+    }
+}
+
+/// Reads the header from the contiguous part of a packet.
+#[inline(always)]
+fn load_contiguous_ip_header(skb: *mut __sk_buff, tag: u32) -> Option<[u32; 5]> {
     let mut header = MaybeUninit::<[u32; 5]>::uninit();
     // SAFETY: the destination has the size given; the kernel checks the offset.
     let result = unsafe {
         bpf_skb_load_bytes_relative(
             skb.cast(),
-            0,
+            tag,
             header.as_mut_ptr().cast(),
             size_of::<[u32; 5]>() as u32,
             FROM_IP_HEADER,
@@ -156,6 +171,8 @@ pub fn link_header_len(skb: *mut __sk_buff, header: &[u32; 5]) -> u32 {
         offset
     } else if is_at(skb, header, ETHERNET_LEN) {
         ETHERNET_LEN
+    } else if is_at(skb, header, ETHERNET_LEN + TAG_LEN) {
+        ETHERNET_LEN + TAG_LEN
     } else {
         NO_LINK_HEADER
     }
@@ -209,14 +226,14 @@ pub extern "C" fn parse_ip_packet(skb: *mut __sk_buff, slot: u32, at: u32, start
     1
 }
 
-/// Returns the offset of the IP header in a frame at a packet socket. The kernel strips the outer VLAN tag of received
-/// frames, but not a second one.
+/// Returns how far the IP header of a frame is behind the place where the kernel expects it. The kernel
+/// strips the outer VLAN tag of received frames, but not a second one.
 #[inline(always)]
 pub fn ip_header_offset(skb: *mut __sk_buff) -> u32 {
     // SAFETY: the verifier rewrites reads of these fields.
     let (pkt_type, protocol) = unsafe { ((*skb).pkt_type, (*skb).protocol) };
     if pkt_type != PACKET_OUTGOING && (protocol == ETH_P_8021Q || protocol == ETH_P_8021AD) {
-        4
+        TAG_LEN
     } else {
         0
     }

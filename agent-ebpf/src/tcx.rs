@@ -26,7 +26,7 @@ const TCP: u32 = 6;
 // separate, because the stacks of nested functions add up.
 #[inline(always)]
 pub fn process_packet(skb: *mut __sk_buff, at: u32) -> Option<()> {
-    let [first, second, third, ..] = packet::load_ip_header(skb)?;
+    let [first, second, third, ..] = packet::load_ip_header(skb, at)?;
     let version = u32::from_be(first) >> 28;
     let protocol = u32::from_be(third) >> 16 & 0xff;
     if version == 4 && protocol != UDP && protocol != TCP || version != 4 && version != 6 {
@@ -53,7 +53,7 @@ pub fn process_packet(skb: *mut __sk_buff, at: u32) -> Option<()> {
 /// Decides what happens to a packet, and passes it to user space if it is needed.
 #[inline(always)]
 fn decide(skb: *mut __sk_buff, slot: u32, at: u32) {
-    let start = link_header_len(skb);
+    let start = link_header_len(skb, at);
     if start == packet::NO_LINK_HEADER {
         return;
     }
@@ -71,8 +71,8 @@ fn decide(skb: *mut __sk_buff, slot: u32, at: u32) {
 /// Returns the offset of the IP header, as [`packet::link_header_len`] does.
 #[unsafe(export_name = "tcx_link_header_len")]
 #[inline(never)]
-pub extern "C" fn link_header_len(skb: *mut __sk_buff) -> u32 {
-    match packet::load_ip_header(skb) {
+pub extern "C" fn link_header_len(skb: *mut __sk_buff, at: u32) -> u32 {
+    match packet::load_ip_header(skb, at) {
         Some(header) => packet::link_header_len(skb, &header),
         None => packet::NO_LINK_HEADER,
     }
@@ -82,7 +82,7 @@ pub extern "C" fn link_header_len(skb: *mut __sk_buff) -> u32 {
 #[unsafe(export_name = "follow_tcx_fragment")]
 #[inline(never)]
 pub extern "C" fn follow_fragment(skb: *mut __sk_buff, slot: u32, at: u32) -> u32 {
-    let Some(header) = packet::load_ip_header(skb) else {
+    let Some(header) = packet::load_ip_header(skb, at) else {
         return 0;
     };
     let start = packet::link_header_len(skb, &header);

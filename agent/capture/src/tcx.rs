@@ -101,9 +101,13 @@ enum Worker {
     },
 }
 
-/// Attaches the programs to the interface with this index, or detaches them.
+/// Work of the thread.
 enum Request {
+    /// Holds the links that exist.
+    Adopt(BTreeMap<u32, Vec<OwnedFd>>),
+    /// Attaches the programs to the interface with this index.
     Attach(u32),
+    /// Detaches them.
     Detach(u32),
 }
 
@@ -140,22 +144,22 @@ impl Tcx {
         let Worker::Caller(links) = &mut self.worker else {
             return Ok(());
         };
-        let mut links = Links {
-            programs: [
-                links.programs[0].try_clone()?,
-                links.programs[1].try_clone()?,
-            ],
-            held: std::mem::take(&mut links.held),
+        let [ingress, egress] = &links.programs;
+        let mut of_thread = Links {
+            programs: [ingress.try_clone()?, egress.try_clone()?],
+            held: BTreeMap::new(),
         };
         let refused = Arc::clone(&self.refused);
         let (requests, incoming) = sync_channel(KnownInterfaces::CAP);
         let thread = Builder::new().name("tcx".to_owned()).stack_size(256 << 10);
-        let work = Box::new(move || links.serve(&incoming, &refused));
+        let work = Box::new(move || of_thread.serve(&incoming, &refused));
         // A thread begins in the namespace of its creator.
         let thread = match path {
             Some(path) => netns::within(path, || spawn(Task::Tcx, thread, work))??,
             None => spawn(Task::Tcx, thread, work)?,
         };
+        // The queue is empty, and the thread waits for it.
+        let _ = requests.try_send(Request::Adopt(std::mem::take(&mut links.held)));
         self.worker = Worker::Thread {
             requests: Some(requests),
             thread: Some(thread),
@@ -222,6 +226,7 @@ impl Links {
     fn serve(&mut self, requests: &Receiver<Request>, refused: &AtomicU64) {
         for request in requests {
             match request {
+                Request::Adopt(held) => self.held = held,
                 Request::Attach(interface) => {
                     if let Err(source) = self.attach(interface) {
                         refused.fetch_add(1, Ordering::Relaxed);

@@ -228,6 +228,11 @@ fn send_all(link: &Link) -> Result<()> {
     exchange(&at_robot, &at_monitor)?;
     exchange(&at_monitor, &at_robot)?;
     exchange(&on_loopback[0], &on_loopback[1])?;
+    // A multicast datagram is sent to the link, and comes back for the member on its own host.
+    let group = Ipv4Addr::new(239, 255, 17, 1);
+    let member = socket(robot, group)?;
+    member.join_multicast_v4(&group, &robot.address())?;
+    exchange(&at_robot, &member)?;
     stream(robot, monitor, monitor.address())?;
     stream(monitor, robot, robot.address())
 }

@@ -261,7 +261,7 @@ fn without_the_capability_to_attach_the_wire_is_selected_and_the_log_has_the_rea
     let line = log.lines().find(|line| line.contains("host hook not used"));
     let line = line.with_context(|| format!("no reason in {log}"))?;
     assert!(
-        line.contains("CAP_NET_ADMIN") && line.contains("using packet sockets"),
+        line.contains("CAP_NET_ADMIN") && line.contains("observing interfaces"),
         "{line}"
     );
     let source = [("source", "wire")];
