@@ -39,7 +39,7 @@ enum Beside {
     Nothing,
     /// A thread that always computes.
     Busy,
-    /// A thread of real-time priority that computes for about half of the time.
+    /// A thread of real-time priority that computes for most of the time.
     RealTime,
 }
 
@@ -217,7 +217,10 @@ impl Robot<'_, '_> {
             truth.as_secs_f64()
         );
         // A call of 10 ms or less is not late.
-        ensure!(waited.is_ok() || late.calls >= NUMBER as f64 * 0.9, "{text}");
+        ensure!(
+            waited.is_ok() || late.calls >= NUMBER as f64 * 0.9,
+            "{text}"
+        );
         let others = late.calls - late.busy;
         ensure!(
             late.of_cause >= others * 0.95 && others >= late.calls * 0.5,
@@ -251,14 +254,16 @@ impl Robot<'_, '_> {
             Beside::Busy | Beside::RealTime => "0".to_owned(),
         };
         let id = self.subscriber.pid().to_string();
-        let pinned = Command::new("taskset").args(["-apc", &cpus, &id]).output()?;
+        let pinned = Command::new("taskset")
+            .args(["-apc", &cpus, &id])
+            .output()?;
         ensure!(pinned.status.success(), "{pinned:?}");
         Ok(match beside {
             Beside::Nothing => None,
             Beside::Busy => Some(Busy::start(&[], "while :; do :; done")?),
             Beside::RealTime => Some(Busy::start(
                 &["chrt", "-f", "50"],
-                "while :; do i=0; while [ $i -lt 30000 ]; do i=$((i+1)); done; sleep 0.03; done",
+                "while :; do i=0; while [ $i -lt 60000 ]; do i=$((i+1)); done; sleep 0.01; done",
             )?),
         })
     }

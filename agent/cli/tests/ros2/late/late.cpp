@@ -92,10 +92,10 @@ public:
   // Returns for how long this thread did not run.
   int64_t stop()
   {
+    const int64_t begin = read_clock(CLOCK_MONOTONIC);
     if (write(request_, "", 1) != 1) {
       std::abort();
     }
-    const int64_t begin = read_clock(CLOCK_MONOTONIC);
     int64_t last = begin, gap = 0;
     while (gap < 20 * kMillisecond && last - begin < 500 * kMillisecond) {
       const int64_t next = read_clock(CLOCK_MONOTONIC);
@@ -154,7 +154,7 @@ public:
   Late(const std::string & file, Stopper & stopper)
   : Node("late"), file_(open(file.c_str(), O_RDWR | O_CREAT | O_TRUNC, 0600)), stopper_(stopper)
   {
-    bytes_.resize(8 << 20, 'x');
+    bytes_.resize(64 << 10, 'x');
     work_ = create_subscription<String>(
       "/work", 100, [this](String::ConstSharedPtr message) {handle(message->data);});
     before_ = create_subscription<String>(
@@ -182,12 +182,16 @@ private:
       injected_ += stopper_.stop();
       return;
     } else if (command == "disk") {
-      if (pwrite(file_, bytes_.data(), bytes_.size(), 0) < 0) {
-        std::abort();
+      for (int64_t synced = 0; synced < 30 * kMillisecond; ) {
+        if (pwrite(file_, bytes_.data(), bytes_.size(), 0) < 0) {
+          std::abort();
+        }
+        const int64_t sync = read_clock(CLOCK_MONOTONIC);
+        fsync(file_);
+        const int64_t taken = read_clock(CLOCK_MONOTONIC) - sync;
+        synced += taken;
+        injected_ += taken;
       }
-      const int64_t sync = read_clock(CLOCK_MONOTONIC);
-      fsync(file_);
-      injected_ += read_clock(CLOCK_MONOTONIC) - sync;
       return;
     }
     injected_ += read_clock(CLOCK_MONOTONIC) - begin;
