@@ -76,7 +76,7 @@ impl Kept {
         let content = [&items.to_le_bytes(), request.encoded.as_slice()].concat();
         let mut lost = 0;
         let appended = self.queue.append(now(), content, &mut |record| {
-            if let Some(request) = KeptRequest::of(record) {
+            if let Some(request) = KeptRequest::of(&record) {
                 lost += request.items;
             }
         });
@@ -126,7 +126,7 @@ impl Kept {
                 tracing::warn!(signal, %error, "cannot read items for OTLP from disk");
             }
             let record = record.ok()??;
-            if let Some(request) = KeptRequest::of(record) {
+            if let Some(request) = KeptRequest::of(&record) {
                 return Some(request);
             }
         }
@@ -153,7 +153,7 @@ impl KeptRequest {
     }
 
     /// Returns the request of a record; `None` for one that was delivered, or of another form.
-    fn of(record: Record) -> Option<Self> {
+    fn of(record: &Record) -> Option<Self> {
         if !record.is_waiting {
             return None;
         }
