@@ -62,8 +62,10 @@ function list(noun, words, answer) {
  */
 function named(noun, name, words, answer) {
   const domain = words.get('domain_id');
-  const found = answer[noun].find((/** @type {any} */ each) => (domain == null || each.domain_id === Number(domain))
+  const all = answer[noun].filter((/** @type {any} */ each) => (domain == null || each.domain_id === Number(domain))
     && [each.name, each.dds_name, each.name.replace(/^\//, '')].includes(name));
+  // Requests and replies of a service have the ROS name of the service, which a topic may have, too.
+  const found = all.find((/** @type {any} */ each) => !['service_request', 'service_reply'].includes(each.kind)) ?? all[0];
   if (!found) throw new Refusal(404, 'it is not in what the history keeps of that time');
   if (noun === 'topics') return found;
   const shown = (/** @type {any[]} */ names) => names.filter((each) => !isHidden(each.name));

@@ -78,7 +78,7 @@ const RETRY_MS = 10000;
  * until the next one of the same path.
  * @param {string|null} path null sends no request
  * @param {string} part what of the path is requested; after an error, no other part stays
- * @param {number} every milliseconds; 0 sends one request
+ * @param {number} every milliseconds; 0 sends requests until one is answered
  * @param {(signal: AbortSignal) => Promise<any>} ask
  * @param {() => boolean} may whether requests make sense now
  * @returns {{data: any, problem: Refusal|null, refresh: () => void}}
@@ -95,19 +95,22 @@ export function useRequest(path, part, every, ask, may) {
     let timer = 0;
     const request = async () => {
       clearTimeout(timer);
-      let wait = Math.min(every, RETRY_MS);
+      let wait = every > 0 ? Math.min(every, RETRY_MS) : RETRY_MS;
+      let isAnswered = false;
       if (document.visibilityState !== 'hidden' && may()) {
         try {
           take({ path, part, data: await ask(abort.signal), problem: null });
           wait = every;
+          isAnswered = true;
         } catch (error) {
           if (abort.signal.aborted) return;
           const problem = error instanceof Refusal ? error : new Refusal(0, String(error));
+          isAnswered = ![0, 503].includes(problem.status);
           take((/** @type {any} */ before) => ({ path, part, problem,
             data: before.path === path && before.part === part ? before.data : null }));
         }
       }
-      if (every > 0 && !abort.signal.aborted) timer = setTimeout(request, wait);
+      if ((every > 0 || !isAnswered) && !abort.signal.aborted) timer = setTimeout(request, wait);
     };
     again.current = request;
     request();

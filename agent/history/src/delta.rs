@@ -31,6 +31,13 @@ struct Steps {
     other: Vec<u8>,
 }
 
+/// Returns whether the pieces of a text are so few that finding them takes little memory: each takes
+/// eight bytes.
+pub(crate) fn is_comparable(text: &[u8]) -> bool {
+    let pieces = text.iter().filter(|byte| **byte == b',').count();
+    pieces <= text.len() / 8
+}
+
 /// Returns how `new` differs from `base`.
 pub(crate) fn difference(base: &[u8], new: &[u8]) -> Vec<u8> {
     let base = Pieces::of(base);

@@ -148,6 +148,7 @@ impl<'a> VersionReader<'a> {
 
 /// Writes the difference, or the whole document if that is shorter.
 fn write_change(block: &mut Vec<u8>, name: &str, before: Option<&[u8]>, content: &[u8]) {
+    let before = before.filter(|before| delta::is_comparable(before));
     let difference = before.map(|before| delta::difference(before, content));
     match difference.filter(|difference| difference.len() < content.len()) {
         Some(difference) => {

@@ -11,7 +11,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use crate::block::{Block, Kind};
 use crate::columns::{self, Name, Row};
 use crate::documents::{Document, DocumentVersion, VersionReader, Versions};
-use crate::file::Blocks;
+use crate::file::{Blocks, FIRST_PLACE};
 use crate::merge::{Merge, merge_by_name};
 use crate::rows::{ProcessName, ProcessRow, Series, TopicName, TopicRow};
 
@@ -170,9 +170,16 @@ impl Store {
         Ok(())
     }
 
+    /// Returns how many bytes the documents of one time may have together: 4 MiB, and at most half of
+    /// the tier's part of the limit.
+    #[must_use]
+    pub fn document_room(&self) -> usize {
+        let most = (Tier::Documents.budget(self.limit) / 2).min(MAX_DOCUMENT_BYTES);
+        usize::try_from(most).unwrap_or(usize::MAX)
+    }
+
     /// Appends the documents of a time: whole ones at the begin of a file, and later what changed.
-    /// All of them take 4 MiB at most, and half of the tier's part of the limit. A document without
-    /// room is left out.
+    /// A document beyond [`Self::document_room`] is left out.
     ///
     /// # Errors
     ///
@@ -184,7 +191,6 @@ impl Store {
         documents: impl Iterator<Item = Document>,
     ) -> io::Result<()> {
         let tier = Tier::Documents;
-        let most = (tier.budget(self.limit) / 2).min(MAX_DOCUMENT_BYTES);
         let mut versions = self.versions.lock().unwrap_or_else(PoisonError::into_inner);
         prepare(&self.directory)?;
         let continued = self.unfinished(tier, begin, (begin, end)).filter(|file| {
@@ -198,14 +204,21 @@ impl Store {
                 Blocks::create(self.free_path(tier, begin), begin)?
             }
         };
-        let content = versions.block(documents, most as usize);
+        let content = versions.block(documents, self.document_room());
         versions.path = None;
+        let (path, is_new) = (file.path.clone(), file.length == FIRST_PLACE);
         let file = file.with(&[Block {
             kind: Kind::Documents,
             begin,
             end,
             content,
-        }])?;
+        }]);
+        let file = file.inspect_err(|_| {
+            // Nothing would delete a file without a block.
+            if is_new {
+                let _ = fs::remove_file(&path);
+            }
+        })?;
         versions.path = Some(file.path.clone());
         drop(versions);
         self.finish_append(tier, file);

@@ -1,5 +1,7 @@
 //! Answers of the API that the history keeps, for views of a moment in the past.
 
+use std::io;
+
 use ros2probe_api::chains::ChainList;
 use ros2probe_api::clocks::Clocks;
 use ros2probe_api::diagnostics::Diagnostics;
@@ -63,40 +65,80 @@ pub(super) const fn required_rights(noun: KeptNoun) -> Access {
     }
 }
 
-/// Returns the present answers of all nouns, each when it is needed.
-pub(super) fn present(context: &Context) -> impl Iterator<Item = Document> {
-    let state = context.latest.state();
+/// Returns the answers of all nouns about a state, each when it is needed: at most `room` bytes
+/// together. An answer without room is left out. Before the first snapshot, no answer is returned.
+pub(super) fn of_state<'a>(
+    context: &'a Context,
+    state: &'a State,
+    mut room: usize,
+) -> impl Iterator<Item = Document> + use<'a> {
     let all = KeptNoun::ALL.into_iter();
-    all.map(move |noun| Document {
-        name: noun.label().to_owned(),
-        content: answer(noun, context, &state),
+    let all = all.filter(|_| state.snapshot.is_some());
+    all.filter_map(move |noun| {
+        let content = answer(noun, context, state, room)?;
+        room = room.saturating_sub(content.len());
+        let name = noun.label().to_owned();
+        Some(Document { name, content })
     })
 }
 
-fn answer(noun: KeptNoun, context: &Context, state: &State) -> Vec<u8> {
+fn answer(noun: KeptNoun, context: &Context, state: &State, room: usize) -> Option<Vec<u8>> {
     let snapshot = state.known();
     let (scope, domain) = (Scope::EVERYTHING, Domain::default());
     match noun {
-        KeptNoun::Parameters => json(&ros_parameters::answer(snapshot, |_, _| true)),
-        KeptNoun::Diagnostics => json(&diagnostics::answer(snapshot, |_| true)),
-        KeptNoun::Transforms => json(&transforms::answer(snapshot, domain)),
-        KeptNoun::Clocks => json(&clocks::answer(snapshot)),
-        KeptNoun::Chains => json(&chains::all(snapshot)),
-        KeptNoun::Actions => json(&actions::answer(snapshot, scope)),
-        KeptNoun::Services => json(&services::answer(snapshot, scope)),
-        KeptNoun::Health => json(&health::answer(context)),
-        KeptNoun::Logs => json(&logs::all(snapshot)),
-        KeptNoun::Participants => json(&participants::answer(snapshot, domain)),
-        KeptNoun::Nodes => json(&nodes::answer(snapshot, scope)),
-        KeptNoun::Graph => json(&graph::graph(snapshot, scope)),
+        KeptNoun::Parameters => json(&ros_parameters::answer(snapshot, |_, _| true), room),
+        KeptNoun::Diagnostics => json(&diagnostics::answer(snapshot, |_| true), room),
+        KeptNoun::Transforms => json(&transforms::answer(snapshot, domain), room),
+        KeptNoun::Clocks => json(&clocks::answer(snapshot), room),
+        KeptNoun::Chains => json(&chains::all(snapshot), room),
+        KeptNoun::Actions => json(&actions::answer(snapshot, scope), room),
+        KeptNoun::Services => json(&services::answer(snapshot, scope), room),
+        KeptNoun::Health => json(&health::answer(context), room),
+        KeptNoun::Logs => json(&logs::all(snapshot), room),
+        KeptNoun::Participants => json(&participants::answer(snapshot, domain), room),
+        KeptNoun::Nodes => json(&nodes::answer(snapshot, scope), room),
+        KeptNoun::Graph => json(&graph::graph(snapshot, scope), room),
         KeptNoun::Topics => {
             let in_force = context.watches.active();
-            json(&topics::details_without_figures(state, &in_force))
+            let mut all = topics::details_without_figures(state, &in_force);
+            // Some topics say more than none.
+            loop {
+                let json = json(&all, room);
+                if json.is_some() || all.topics.is_empty() {
+                    return json;
+                }
+                all.topics.truncate(all.topics.len() / 2);
+            }
         }
     }
 }
 
-fn json(answer: &impl Serialize) -> Vec<u8> {
-    // Serializing plain numbers and strings into memory cannot fail.
-    serde_json::to_vec(answer).unwrap_or_default()
+/// Returns an answer of at most `room` bytes; `None` for a larger one.
+fn json(answer: &impl Serialize, room: usize) -> Option<Vec<u8>> {
+    let mut limited = Limited {
+        bytes: Vec::new(),
+        room,
+    };
+    serde_json::to_writer(&mut limited, answer).ok()?;
+    Some(limited.bytes)
+}
+
+/// Bytes up to a length. A longer answer takes no memory beyond it.
+struct Limited {
+    bytes: Vec<u8>,
+    room: usize,
+}
+
+impl io::Write for Limited {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        if self.bytes.len() + bytes.len() > self.room {
+            return Err(io::ErrorKind::StorageFull.into());
+        }
+        self.bytes.extend_from_slice(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
 }

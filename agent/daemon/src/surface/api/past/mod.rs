@@ -48,6 +48,10 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
         .routes(routes!(events))
 }
 
+/// Maximum age of an answer at a moment, in seconds: if some minutes could not be written, an earlier
+/// answer must not pass for one of them.
+const MAX_AGE_S: u32 = 150;
+
 /// The moment of a question.
 #[derive(Clone, Copy, Debug, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields)]
@@ -160,7 +164,12 @@ async fn get_answer(
     let noun = labelled("noun", &noun, &KeptNoun::ALL, KeptNoun::label)?;
     granted.require(answers::required_rights(noun))?;
     let at = query::second(moment.at)?;
-    let read = read_store(&context, move |store| store.document(noun.label(), at));
+    let read = read_store(&context, move |store| {
+        // Graph and tables of the moment are those of this time.
+        let time = store.state(at).map_or(at, |state| state.end);
+        let version = store.document(noun.label(), time)?;
+        (time.saturating_sub(version.at) <= MAX_AGE_S).then_some(version)
+    });
     let (version, _permit) = read.await?;
     let version = version.ok_or_else(|| {
         let detail = format!("no answer of /{} of that time is kept", noun.label());

@@ -1,6 +1,7 @@
 //! Requests for the history on a storage that does not answer.
 
 use std::path::Path;
+use std::sync::Arc;
 
 use axum::Extension;
 use axum::body::{Body, to_bytes};
@@ -11,6 +12,7 @@ use ros2probe_api::doctor::{Report, Severity};
 use ros2probe_api::history::KeptNoun;
 use ros2probe_api::topics::TopicDetailsList;
 use ros2probe_capture::reassembly::Limits;
+use ros2probe_model::report::snapshot::Snapshot;
 use ros2probe_testing::repository;
 
 use super::super::security::Rights;
@@ -22,6 +24,7 @@ use crate::agent_facts::SourceKind;
 use crate::config::{Access, Config};
 use crate::run::replay::Replay;
 use crate::settings_cell::Settings;
+use crate::snapshot_cell::State;
 use crate::surface::MetricSources;
 
 /// Returns the context of an agent with a history in this directory.
@@ -99,15 +102,41 @@ async fn ask(context: &Context, access: Access, path: &str) -> (StatusCode, Vec<
     (status, body.to_vec())
 }
 
+/// Returns the state after a first snapshot.
+fn known(context: &Context) -> Arc<State> {
+    let agent = context.latest.state().agent.clone();
+    let snapshot = Some(Arc::new(Snapshot::default()));
+    Arc::new(State { snapshot, agent })
+}
+
+#[test]
+fn answers_take_no_more_than_their_room() {
+    let directory = tempfile::tempdir().unwrap();
+    let context = context(directory.path());
+    let known = known(&context);
+    let sizes = |room| -> Vec<usize> {
+        let documents = answers::of_state(&context, &known, room);
+        documents.map(|document| document.content.len()).collect()
+    };
+    let all = sizes(usize::MAX);
+    assert_eq!(all.len(), KeptNoun::ALL.len());
+    for room in [0, 100, 500] {
+        let kept = sizes(room);
+        assert!(kept.len() < all.len() && kept.iter().sum::<usize>() <= room);
+    }
+}
+
 #[tokio::test]
 async fn an_answer_of_the_past_is_found_after_a_restart_by_clients_with_its_rights() {
     let directory = tempfile::tempdir().unwrap();
     let before = context(directory.path());
     assert!(before.disk_history.open());
     let store = before.disk_history.store().unwrap();
-    store
-        .append_documents(0, 60, answers::present(&before))
-        .unwrap();
+    let (unknown, known) = (before.latest.state(), known(&before));
+    assert_eq!(answers::of_state(&before, &unknown, usize::MAX).count(), 0);
+    let room = store.document_room();
+    let documents = answers::of_state(&before, &known, room);
+    store.append_documents(0, 60, documents).unwrap();
     drop(before);
 
     let context = context(directory.path());

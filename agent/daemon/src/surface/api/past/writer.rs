@@ -223,7 +223,7 @@ impl Minute {
         let Some(store) = history.store() else {
             return;
         };
-        let past = self.context.latest.past();
+        let (past, state) = (self.context.latest.past(), self.context.latest.state());
         let last = past.seconds().last();
         let now = last.map_or_else(unix_time, |last| seconds(last.at));
         // A source that went back has begun again.
@@ -254,8 +254,10 @@ impl Minute {
         if let Some(last) = last {
             (self.written, self.written_end) = (now, last.end);
         }
-        let written = append(store, blocks, now)
-            .and_then(|()| store.append_documents(begin, now, answers::present(&self.context)));
+        let written = append(store, blocks, now).and_then(|()| {
+            let answers = answers::of_state(&self.context, &state, store.document_room());
+            store.append_documents(begin, now, answers)
+        });
         history.count(&written);
         let failed_before = std::mem::replace(&mut self.is_failing, written.is_err());
         match written {
