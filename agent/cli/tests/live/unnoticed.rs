@@ -204,7 +204,7 @@ fn the_listeners_are_the_only_network_sockets_of_the_agent() -> Result<()> {
         assert_eq!(of_table(table)?, Vec::<Vec<String>>::new(), "{table}");
     }
     // Programs at tcx need no socket.
-    let wire = agent
+    let hooks = agent
         .scrape()?
         .labels_of("ros2probe_capture_wire_info", "hook");
     let packet_sockets = usize::from(hooks.contains("packet"));

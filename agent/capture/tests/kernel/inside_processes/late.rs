@@ -61,11 +61,26 @@ pub(super) fn late(robot: &mut Robot, process: &mut Process, command: &str) -> V
     robot.round().report.late
 }
 
+/// Returns the calls whose events are complete: on a busy machine the kernel may skip an event of one
+/// of ten.
+fn complete(calls: &[LateCall]) -> Vec<&LateCall> {
+    let has_all = |call: &&LateCall| {
+        let activity = call.activity.as_ref();
+        activity.is_none_or(|activity| activity.missed_events == 0)
+    };
+    let complete: Vec<_> = calls.iter().filter(has_all).collect();
+    assert!(
+        calls.len() - complete.len() <= calls.len().div_ceil(10),
+        "{calls:#?}"
+    );
+    complete
+}
+
 /// Asserts that each call is late for this cause, which took this share of its time or more. On a
 /// busy machine, a call may also wait for a CPU, even for longer. That time is left out.
 fn assert_cause(calls: &[LateCall], number: usize, cause: Cause, share: f64) {
     assert_eq!(calls.len(), number, "{calls:#?}");
-    for call in calls {
+    for call in complete(calls) {
         let parts = call.parts();
         let sum: Duration = parts.iter().map(|part| part.duration).sum();
         assert_eq!(sum, call.total(), "{call:#?}");
@@ -89,7 +104,7 @@ fn a_call_that_sleeps_names_the_system_call() {
     let (mut robot, mut process) = started();
     let calls = late(&mut robot, &mut process, "sleep 10 20000");
     assert_cause(&calls, 10, Cause::Sleep, 0.5);
-    for call in &calls {
+    for call in complete(&calls) {
         let longest = call.activity.as_ref().unwrap().longest.as_ref().unwrap();
         assert_eq!(longest.call.as_deref(), Some("clock_nanosleep"));
         assert!(longest.duration >= Duration::from_millis(20), "{longest:?}");
