@@ -105,8 +105,8 @@ pub extern "C" fn process_fragment(skb: *mut __sk_buff, slot: u32) -> u32 {
 }
 
 /// Handles a fragment of a datagram whose first fragment was seen, if its bytes are not needed or only
-/// continue a record. Returns `false`, and has changed nothing, if [`process_fragment`] must handle
-/// it.
+/// continue a record. Returns `false` if [`process_fragment`] must handle it: after the submessages by
+/// which the record was continued.
 #[inline(always)]
 pub fn follow(skb: *mut __sk_buff, slot: u32, key: &FlowKey, trailing: &Trailing) -> bool {
     // SAFETY: as in `flow`.

@@ -3,13 +3,13 @@
 //!
 //! The crate is thin on purpose: `ros2probe_wire::walk`, which user space runs too, reads
 //! submessages and decides what happens to them. This crate adds the socket buffer, the maps and
-//! the fragments. [`wire`], or [`tcx_ingress`] and [`tcx_egress`], read frames on interfaces. [`host_ingress`] and [`host_egress`] read
-//! datagrams at sockets, [`zenoh_ingress`] and [`zenoh_egress`] TCP segments. If enabled,
-//! [`shm_handed`] reads messages in the process that sends them, and [`received_ipv4`] notes when
-//! threads receive datagrams.
+//! the fragments. [`wire`], or [`tcx_ingress`] and [`tcx_egress`], read frames on interfaces.
+//! [`host_ingress`] and [`host_egress`] read datagrams at sockets, [`zenoh_ingress`] and
+//! [`zenoh_egress`] TCP segments. If enabled, [`shm_handed`] reads messages in the process that sends
+//! them, and [`received_ipv4`] notes when threads receive datagrams.
 //!
-//! The programs use only what the verifier of Linux 5.10 accepts: bounded loops, global functions
-//! that are verified once, reads of fixed size, no spin lock, no atomics that return a value.
+//! The programs for tcx need Linux 6.6. The others use only what the verifier of Linux 5.10 accepts:
+//! bounded loops, global functions that are verified once, reads of fixed size, no spin lock, no atomics that return a value.
 
 #![no_std]
 #![no_main]

@@ -59,20 +59,7 @@ pub extern "C" fn write_capture(skb: *mut __sk_buff, slot: u32) -> u32 {
     piece.flags = record.flags & DATAGRAM_FLAGS;
     let len = scratch.walk.datagram_len;
     let base = packet.payload_offset + 8;
-    let (mut offset, mut piece_count) = (0, 0);
-    while piece_count < PIECES_PER_DATAGRAM {
-        if offset >= len {
-            break;
-        }
-        if write_piece(skb, slot, base, offset) == 0 {
-            count(slot, Counter::PiecesLost, 1);
-            return 0;
-        }
-        offset += PIECE_BYTES;
-        piece_count += 1;
-    }
-    count(slot, Counter::CapturedBytes, u64::from(len));
-    1
+    write_pieces(skb, slot, base, len)
 }
 
 /// Writes a frame to the ring, from its IP header on; returns 1 if every piece fit. The lower half of
@@ -101,6 +88,12 @@ pub extern "C" fn write_frame(skb: *mut __sk_buff, slot: u32, place: u64) -> u32
         } else {
             0
         };
+    write_pieces(skb, slot, base, len)
+}
+
+/// Writes `len` bytes from `base` in pieces; returns 1 if every piece fit.
+#[inline(always)]
+fn write_pieces(skb: *mut __sk_buff, slot: u32, base: u32, len: u32) -> u32 {
     let (mut offset, mut piece_count) = (0, 0);
     while piece_count < PIECES_PER_DATAGRAM {
         if offset >= len {

@@ -188,7 +188,7 @@ fn a_sample_in_many_datagrams_is_one_record_up_to_a_missing_fragment() {
         assert_eq!(
             show(&[1, 2]),
             [(1, 2)],
-            "what nobody continues is taken out"
+            "a record without a continuation is written, too"
         );
     });
 }
