@@ -14,15 +14,15 @@ use opentelemetry_proto::tonic::collector::logs::v1::{
 };
 use opentelemetry_proto::tonic::common::v1::any_value::Value;
 use ros2probe_metrics::export_thread::ExportThread;
-use ros2probe_metrics::otlp::{self, Exports, Host, Inputs, Outcome, Reason, Settings, Signal};
+use ros2probe_metrics::otlp::{Exports, Outcome, Reason, Signal};
 use tokio::net::TcpListener;
 use tonic::transport::server::{Server, TcpIncoming};
 use tonic::{Code, Status};
 
 use crate::agent_facts::SourceKind;
-use crate::config::Config;
 use crate::events::{AgentEvent, EventLog};
 use crate::surface::MetricSources;
+use crate::surface::export_tests::start_with;
 
 /// Header that each request must have, also the first one after a start.
 const TOKEN: &str = "x-robot-token";
@@ -94,27 +94,15 @@ impl Exporting {
             "otlp: {{endpoint: 'http://{address}', metrics: false, traces: false, \
              timeout_s: 1, headers: {{{TOKEN}: secret}}}}"
         );
-        let config = Config::parse(yaml.as_bytes()).unwrap();
-        let (host, read) = (Host::default(), crate::file::read_text);
-        let settings = Settings::resolve(&config.otlp, &|_| None, read, &host).unwrap();
-        let settings = settings.unwrap();
         let sources = MetricSources::new(
             SourceKind::Replay,
             crate::settings_cell::Settings::default(),
         );
-        let inputs = Inputs {
-            metrics: Arc::new(sources.clone()),
-            events: Arc::<EventLog>::clone(&sources.events),
-            spans: Arc::default(),
-            log: None,
-            node_logs: Arc::default(),
-            exports: Arc::clone(&sources.exports),
-            directory: Some(directory.to_owned()),
-        };
+        let thread = start_with(&yaml, &sources, Some(directory));
         Self {
             events: sources.events,
             exports: sources.exports,
-            thread: otlp::start(settings, inputs, crate::privilege::spawn_export).unwrap(),
+            thread,
         }
     }
 

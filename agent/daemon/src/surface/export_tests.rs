@@ -2,6 +2,7 @@
 
 use std::collections::VecDeque;
 use std::net::SocketAddr;
+use std::path::Path;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant, SystemTime};
 
@@ -117,6 +118,15 @@ fn exporting(address: SocketAddr, interval: u32, more: &str) -> (Arc<Exports>, E
 
 fn start(address: SocketAddr, interval: u32, more: &str, sources: &MetricSources) -> ExportThread {
     let yaml = format!("otlp: {{endpoint: 'http://{address}', interval_s: {interval}, {more}}}");
+    start_with(&yaml, sources, None)
+}
+
+/// Starts the exporter of a configuration, with its queues in this directory.
+pub(super) fn start_with(
+    yaml: &str,
+    sources: &MetricSources,
+    directory: Option<&Path>,
+) -> ExportThread {
     let config = Config::parse(yaml.as_bytes()).unwrap();
     let host = Host::default();
     let read = crate::file::read_text;
@@ -128,7 +138,7 @@ fn start(address: SocketAddr, interval: u32, more: &str, sources: &MetricSources
         log: None,
         node_logs: Arc::default(),
         exports: Arc::clone(&sources.exports),
-        directory: None,
+        directory: directory.map(Path::to_owned),
     };
     otlp::start(settings.unwrap(), inputs, crate::privilege::spawn_export).unwrap()
 }
