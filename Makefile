@@ -87,7 +87,7 @@ test-ros2: ## tests against real nodes and the real ros2 command line of each di
 	        --filterset "$$(.ci/prerequisites.sh --ros2-selection $$prefix)" || exit 1; \
 	done
 
-bench-ros2: ## what the agent and `ros2 topic hz` cost nodes of rmw_zenoh; ROUNDS=N (3) (needs root)
+bench-ros2: ## what the agent and `ros2 topic hz` cost nodes of rmw_zenoh, and what causes of late calls cost; ROUNDS=N (3) (needs root)
 	@.ci/prerequisites.sh test
 	ROUNDS=$(or $(ROUNDS),3) cargo test --release --package ros2probe --test ros2 -- --ignored --nocapture cost::
 
@@ -152,6 +152,11 @@ bench: ## benchmarks, and the cost of the agent and of a subscriber (needs root)
 	cargo build --release --package ros2probe --example robot --example workloads
 	@$(SUDO) $(TARGET)/release/examples/workloads $(BENCH_OPTIONS)
 
+tcp-cost: ## what observing adds to TCP that is neither Zenoh nor RTPS; ROUNDS=N (7) (needs root)
+	@.ci/prerequisites.sh test
+	cargo build --release --workspace --example zenoh_cost
+	@$(SUDO) $(TARGET)/release/examples/zenoh_cost $(or $(ROUNDS),7) 2
+
 cost: ## what observing adds to a workload, with intervals, and the time of each kernel program; COST_OPTIONS="--pairs 100 --load 4" (needs root)
 	@.ci/prerequisites.sh test dist
 	@$(MAKE) --no-print-directory peers
@@ -198,4 +203,4 @@ deny: ## licences, sources and known vulnerabilities of dependencies; DENY=bans 
 prerequisites: ## install what demo, test, dist, ebpf and fuzz need
 	@.ci/prerequisites.sh demo test dist ebpf fuzz
 
-.PHONY: help demo fleet fleet-bench test test-fast test-corpus test-ros2 bench-ros2 ebpf run page page-bench screenshots peers arm dist release vm distcheck bench cost soak fuzz miri book deny prerequisites
+.PHONY: help demo fleet fleet-bench test test-fast test-corpus test-ros2 bench-ros2 ebpf run page page-bench screenshots peers arm dist release vm distcheck bench tcp-cost cost soak fuzz miri book deny prerequisites

@@ -13,6 +13,7 @@ import { Agent } from './views/agent.js';
 import { Doctor } from './views/doctor.js';
 import { ChainView, Chains } from './views/chains.js';
 import { Events } from './views/events.js';
+import { Fleet } from './views/fleet.js';
 import { Graph } from './views/graph.js';
 import { NodeView, Nodes } from './views/nodes.js';
 import { Overview } from './views/overview.js';
@@ -30,13 +31,19 @@ applyTheme(theme);
 const VIEWS = [
   ['', 'Overview', 'o'], ['topics', 'Topics', 't'], ['graph', 'Graph', 'g'],
   ['chains', 'Chains', 'c'], ['nodes', 'Nodes', 'n'], ['robot', 'Robot', 'b'], ['events', 'Events', 'e'],
-  ['recordings', 'Recordings', 'r'], ['agent', 'Agent', 'a'],
+  ['recordings', 'Recordings', 'r'], ['agent', 'Agent', 'a'], ['fleet', 'Fleet', 'f'],
 ];
+
+/** Returns the views that this agent has. */
+function ownViews() {
+  return VIEWS.filter(([view]) => view !== 'fleet' || state.open?.has_fleet);
+}
 
 /** Views that have no past, and why. */
 const PRESENT_ONLY = /** @type {Record<string, [string, string]>} */ ({
   recordings: ['Recordings', 'Bags are those that the robot has at present.'],
   doctor: ['Doctor', 'The doctor examines the host as it is at present.'],
+  fleet: ['Fleet', 'The robots are shown as they are at present.'],
 });
 
 function takeToken() {
@@ -113,7 +120,7 @@ function App() {
     </main>
     <${News} />
     ${dialog === 'search' && html`<${Search} close=${() => show(null)} />`}
-    ${dialog === 'keys' && html`<${Keys} views=${VIEWS} close=${() => show(null)} />`}
+    ${dialog === 'keys' && html`<${Keys} views=${ownViews()} close=${() => show(null)} />`}
     ${dialog === 'token' && html`<${Token} close=${() => show(null)} />`}`;
 }
 
@@ -185,6 +192,7 @@ function View({ route }) {
     case 'recordings': return html`<${Recordings} />`;
     case 'agent': return html`<${Agent} />`;
     case 'doctor': return html`<${Doctor} />`;
+    case 'fleet': return html`<${Fleet} name=${route.name} />`;
     default: return html`<h1 tabindex="-1">No such view</h1>
       <p><a href=${address('')}>Overview</a></p>`;
   }
@@ -214,7 +222,7 @@ function Header({ route, show }) {
       </span>
     </div>
     <nav aria-label="Views"><ul>
-      ${VIEWS.map(([view, title]) => html`<li key=${view}><a href=${address(view)}
+      ${ownViews().map(([view, title]) => html`<li key=${view}><a href=${address(view)}
         aria-current=${route?.view === view ? 'page' : undefined}>${title}${
         view === '' && errors > 0
           ? html` <span class="badge error"><${Mark} severity="error" /> ${errors}</span>` : ''}</a></li>`)}
@@ -300,7 +308,7 @@ function keyboard(show) {
     first = '';
     clearTimeout(timer);
     if (before === 'g') {
-      const found = VIEWS.find(([, , key]) => key === event.key);
+      const found = ownViews().find(([, , key]) => key === event.key);
       if (found) location.hash = address(found[0]);
     } else if (event.key === '/') {
       event.preventDefault();

@@ -207,20 +207,6 @@ export function shortened(text, most) {
   return `${characters.slice(0, head).join('')}…${end.join('')}`;
 }
 
-/**
- * Returns the container or the systemd unit of a control group: "container 0123456789ab",
- * "robot.service"; empty for other groups.
- * @param {string|null|undefined} path
- */
-export function groupOf(path) {
-  const parts = (path ?? '').split('/').reverse();
-  for (const part of parts) {
-    const [, id] = /^(?:.*[-:])?([0-9a-f]{12})[0-9a-f]{52}(?:\.scope)?$/.exec(part) ?? [];
-    if (id) return `container ${id}`;
-  }
-  return parts.find((part) => part.endsWith('.service')) ?? '';
-}
-
 /** Words for each event. */
 export const EVENTS = /** @type {Record<string, string>} */ ({
   'ros2.participant.discovered': 'participant appeared', 'ros2.participant.changed': 'participant changed',

@@ -1,7 +1,7 @@
 // Converts the state to the graph view's vertices, edges and boxes.
 // Figures are not used here, so that they change the look but never the layout.
 
-import { groupOf, shortened, visible } from './format.js';
+import { shortened, visible } from './format.js';
 
 /** Number of nodes above which namespace boxes are initially closed. */
 export const MANY_NODES = 60;
@@ -474,7 +474,7 @@ function processes(state, vertices) {
     const participant = participants(each);
     if (!participant) return null;
     const host = participant.host ?? 'unknown host';
-    const group = groupOf(participant.cgroup);
+    const group = participant.container ?? '';
     return { host, group: group && `box:${host} ${group}`, groupName: group,
       process: participant.pid == null ? '' : `box:${host} ${participant.pid}`,
       name: state.processName(participant) };

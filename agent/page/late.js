@@ -16,7 +16,7 @@ const COLOURS = Object.fromEntries(/** @type {[string, string[]][]} */ ([
   ['--line-1', ['runnable', 'throttled', 'stolen', 'stopped']],
   ['--line-2', ['cpu', 'other_callback']],
   ['--line-3', ['lock', 'sleep', 'disk', 'page_fault', 'system_call', 'blocked']],
-  ['--line-4', ['send', 'transit', 'queue', 'middleware', 'arrival']],
+  ['--line-4', ['send', 'transit', 'repaired', 'queue', 'middleware', 'arrival']],
 ]).flatMap(([colour, causes]) => causes.map((cause) => [cause, colour])));
 
 /** Returns the causes as rows: the cause, the calls, the longest one, and what helps.

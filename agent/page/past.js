@@ -29,8 +29,11 @@ export function pastOf(path, at) {
     return { path: `history/processes?from=${at - ROW_S}&to=${at}`, part: processes };
   }
   if (!KEPT.includes(noun) || more.length || (name != null && noun !== 'topics' && noun !== 'nodes')) return null;
-  return { path: `history/moment/${noun}?at=${at}`,
-    part: (answer) => (name == null ? list(noun, words, answer) : named(noun, decodeURIComponent(name), words, answer)) };
+  if (name == null) return { path: `history/moment/${noun}?at=${at}`, part: (answer) => list(noun, words, answer) };
+  const domain = words.get('domain_id');
+  // A list of hundreds of topics has megabytes.
+  return { path: `history/moment/${noun}?at=${at}&name=${name}${domain == null ? '' : `&domain_id=${domain}`}`,
+    part: (answer) => named(noun, answer, decodeURIComponent(name)) };
 }
 
 /** Returns the part of a list that a query selects. @param {string} noun @param {URLSearchParams} words @param {any} answer */
@@ -57,13 +60,13 @@ function list(noun, words, answer) {
 }
 
 /**
- * Returns one topic or node of a list. The path of a node may omit its first slash.
- * @param {string} noun @param {string} name @param {URLSearchParams} words @param {any} answer
+ * Returns the topic or node of an answer that has only those of one name, or of a longer one: a topic
+ * `scan` of DDS has the name of the ROS topic `/scan` without its slash.
+ * @param {string} noun @param {any} answer @param {string} name
  */
-function named(noun, name, words, answer) {
-  const domain = words.get('domain_id');
-  const all = answer[noun].filter((/** @type {any} */ each) => (domain == null || each.domain_id === Number(domain))
-    && [each.name, each.dds_name, each.name.replace(/^\//, '')].includes(name));
+function named(noun, answer, name) {
+  const exact = answer[noun].filter((/** @type {any} */ each) => each.name === name || each.dds_name === name);
+  const all = exact.length ? exact : answer[noun];
   // Requests and replies of a service have the ROS name of the service, which a topic may have, too.
   const found = all.find((/** @type {any} */ each) => !['service_request', 'service_reply'].includes(each.kind)) ?? all[0];
   if (!found) throw new Refusal(404, 'it is not in what the history keeps of that time');

@@ -1,6 +1,6 @@
 // Offered and requested QoS of endpoints, side by side, with incompatible policies marked.
 
-import { count, duration, groupOf, lastMessage, rate } from './format.js';
+import { count, duration, lastMessage, rate } from './format.js';
 import { address } from './router.js';
 import { html, Mark, Name } from './ui.js';
 import { state, stream } from './store.js';
@@ -43,7 +43,7 @@ export function Endpoints({ details, topic }) {
     const participant = own && state.participants.get(own.participant);
     return html`<tr key=${endpoint.guid}><th scope="row"><${Owner} endpoint=${endpoint} /></th>
       <td><${Name} text=${[participant?.host, state.processName(participant),
-        groupOf(participant?.cgroup)].filter(Boolean).join(', ') || 'unknown'} /></td>
+        participant?.container].filter(Boolean).join(', ') || 'unknown'} /></td>
       <td>${endpoint.vendor ?? ''}</td>
       <td><${Name} text=${endpoint.message_type} /></td>
       ${hasBuffers && html`<td><${Name} text=${endpoint.backends.join(', ')} /></td>`}
@@ -61,7 +61,9 @@ export function Endpoints({ details, topic }) {
       ${publishes && hasRates && html`<th scope="col" class="number">Rate</th>`}
       ${publishes && latches && html`<th scope="col">Last message</th>`}
       <th scope="col">GUID</th></tr></thead>
-    <tbody>${list.map((endpoint) => row(endpoint, publishes))}</tbody></table></div>`;
+    <tbody>${list.map((endpoint) => row(endpoint, publishes))}</tbody></table></div>
+    ${publishes && !hasRates && html`<p class="dim">The history keeps the rate of the topic, and not that of each
+      publisher.</p>`}`;
   return html`<section aria-labelledby="endpoints"><h2 id="endpoints">Publishers and
     subscriptions</h2>
     ${details.publishers.length ? table(details.publishers, true)

@@ -6,7 +6,7 @@
  */
 
 const VIEWS = ['', 'topics', 'graph', 'chains', 'nodes', 'robot', 'events', 'recordings', 'agent',
-  'doctor', 'token'];
+  'doctor', 'fleet', 'token'];
 
 /**
  * @param {string} fragment with or without its `#`

@@ -11,7 +11,7 @@ export const MOST_EVENTS = 1000;
 
 /**
  * @typedef {{id: number, guid: string, domain: number, vendor: string|null, host: string|null,
- *   pid: number|null, process: string|null, cgroup: string|null}} Participant
+ *   pid: number|null, process: string|null, cgroup: string|null, container: string|null}} Participant
  * @typedef {{id: number, domain: number, name: string, participants: number[],
  *   hidden: boolean}} Node
  * @typedef {{topic: number, node: number, participant: number, guid: string, passages: number,
@@ -143,10 +143,11 @@ export class State {
   takeGraph(graph) {
     this.structure += 1;
     this.participants = new Map(graph.participants.map((/** @type {any[]} */ row) => {
-      const [id, guid, domain, vendor, announced, pid, process, cgroup] = row;
+      // The history may have rows of an agent that did not send the last element.
+      const [id, guid, domain, vendor, announced, pid, process, cgroup, container = null] = row;
       // Control groups are known only for processes of this host.
       const host = announced ?? (cgroup == null ? null : this.open?.host ?? null);
-      return [id, { id, guid, domain, vendor, host, pid, process, cgroup }];
+      return [id, { id, guid, domain, vendor, host, pid, process, cgroup, container }];
     }));
     this.nodes = new Map(graph.nodes.map((/** @type {any[]} */ row) => {
       const [id, domain, name, participants, hidden] = row;

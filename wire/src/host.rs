@@ -33,9 +33,11 @@ pub mod chunk {
     /// With [`SKIPPED`]: the bytes have samples of publishers that are not known yet, and the budget
     /// for those was spent. The samples may be needed.
     pub const OVER_BUDGET: u16 = 1 << 8;
+    /// The client of the connection begins a handshake of TLS. The chunk has no bytes.
+    pub const CLIENT_HELLO: u16 = 1 << 9;
 }
 
-/// The sender's state of a TCP connection (`struct bpf_tcp_sock` in `linux/bpf.h`).
+/// The sender's state of a TCP connection (`struct bpf_tcp_sock` in `linux/bpf.h`, and `unsent`).
 #[derive(
     Clone, Copy, Default, PartialEq, Eq, Debug, FromBytes, IntoBytes, Immutable, KnownLayout,
 )]
@@ -49,6 +51,10 @@ pub struct Link {
     pub sent: u32,
     /// Number of bytes that were sent and are not acknowledged.
     pub unacknowledged: u32,
+    /// Number of bytes that the application has written and the kernel has not sent yet.
+    pub unsent: u32,
+    /// Zero if the number of unsent bytes is unknown.
+    pub unsent_known: u32,
 }
 
 /// Header of one piece of a captured datagram; the bytes follow. Pieces of one datagram arrive in
@@ -209,11 +215,13 @@ pub enum Layout {
     PidNumbers,
     /// Size of an element of `pid.numbers`, in bytes.
     PidNumberSize,
+    /// `tcp_sock.write_seq`: the sequence number after the last byte that the application wrote.
+    TcpWritten,
 }
 
 impl Layout {
     /// Number of entries.
-    pub const COUNT: usize = Self::PidNumberSize as usize + 1;
+    pub const COUNT: usize = Self::TcpWritten as usize + 1;
     /// Marks a member that the running kernel does not have or does not describe.
     pub const ABSENT: u32 = u32::MAX;
 }

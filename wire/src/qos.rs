@@ -188,7 +188,7 @@ impl Qos {
             durability: Durability::VOLATILE,
             // The specification's discovery data does not contain the history. Cyclone DDS
             // announces it if it differs from KEEP_LAST 1. Fast DDS 2.x never announces it, and
-            // `ros2` shows it as unknown. So it does for KEEP_LAST 1 of 3.2 and later, which
+            // `ros2` shows it as unknown. So it does for KEEP_LAST 1 of 3.2.3 and later, which
             // announces any other history.
             history: match vendor {
                 VendorId::CYCLONE => Some(History {

@@ -16,8 +16,10 @@ pub const RECOGNIZED: usize = 18;
 pub const MAGIC: [u8; 4] = *b"RTCP";
 /// Length of the shortest frame: a header and a control message without a payload.
 const SHORTEST: u32 = 30;
-/// Longest frame that is taken for one: a message of [`MAX_MESSAGE`](crate::walk::MAX_MESSAGE).
-const LONGEST: u32 = crate::walk::MAX_MESSAGE + HEADER_LEN as u32;
+/// Length of the longest frame: a header and a message of
+/// [`MAX_MESSAGE`](crate::walk::MAX_MESSAGE).
+const MAX_LENGTH: u32 = (32 << 20) + 14;
+const _: () = assert!(MAX_LENGTH == crate::walk::MAX_MESSAGE + HEADER_LEN as u32);
 /// The flag of a control message whose integers are little-endian.
 const LITTLE_ENDIAN: u8 = 2;
 
@@ -91,7 +93,7 @@ impl FrameHeader {
     #[inline(always)]
     #[must_use]
     pub const fn is_length(length: u32) -> bool {
-        length >= SHORTEST && length <= LONGEST
+        length >= SHORTEST && length <= MAX_LENGTH
     }
 
     /// Returns whether these bytes begin a control message of the frame: kind, flags and length.
@@ -156,14 +158,14 @@ mod tests {
 
     #[test]
     fn a_length_that_no_frame_has_is_refused() {
-        for length in [0, 14, 29, LONGEST + 1, u32::MAX] {
+        for length in [0, 14, 29, MAX_LENGTH + 1, u32::MAX] {
             assert_eq!(
                 FrameHeader::recognize(message(length, 7411)),
                 None,
                 "{length}"
             );
         }
-        for length in [30, LONGEST] {
+        for length in [30, MAX_LENGTH] {
             assert!(
                 FrameHeader::recognize(message(length, 7411)).is_some(),
                 "{length}"

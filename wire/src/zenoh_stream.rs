@@ -57,6 +57,8 @@ pub enum Beginning {
     KeepAlive,
     /// The first handshake message of either side of TLS, on a port of Zenoh.
     Tls,
+    /// The first handshake message of a client of TLS, on another port. RTPS may be inside.
+    ClientHello,
     /// A byte sequence that may be a batch with a FRAME or FRAGMENT.
     Batch,
     /// Another protocol, or the middle of a batch.
@@ -76,11 +78,10 @@ impl Beginning {
         }
         if low == 0x16 && high == 3 && header <= 4 {
             // A handshake record: ClientHello or ServerHello.
-            let is_hello = kind == 1 || kind == 2;
-            return if is_hello && is_zenoh_port {
-                Self::Tls
-            } else {
-                Self::Other
+            return match kind {
+                1 | 2 if is_zenoh_port => Self::Tls,
+                1 => Self::ClientHello,
+                _ => Self::Other,
             };
         }
         let batch = u16::from_le_bytes([low, high]) as u32;
@@ -216,10 +217,22 @@ mod tests {
     }
 
     #[test]
-    fn a_tls_hello_is_recognized_on_ports_of_zenoh_only() {
-        let head = [0x16, 3, 1, 2, 0, 1, 0, 1];
+    fn a_tls_hello_of_either_side_is_recognized_on_ports_of_zenoh_and_of_a_client_on_any() {
+        let mut head = [0x16, 3, 1, 2, 0, 1, 0, 1];
+        assert_eq!(Beginning::of(head, 200, true), Beginning::Tls);
+        assert_eq!(Beginning::of(head, 200, false), Beginning::ClientHello);
+        head[5] = 2;
         assert_eq!(Beginning::of(head, 200, true), Beginning::Tls);
         assert_eq!(Beginning::of(head, 200, false), Beginning::Other);
+        for (at, value) in [(0, 0x17), (1, 2), (2, 5), (5, 11)] {
+            let mut other = head;
+            other[at] = value;
+            assert_ne!(
+                Beginning::of(other, 200, false),
+                Beginning::ClientHello,
+                "{at}"
+            );
+        }
     }
 
     #[test]

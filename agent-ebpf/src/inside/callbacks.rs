@@ -30,7 +30,7 @@ const CLOCK_TOLERANCE_NS: u64 = 10_000_000;
 const MIN_PERIOD_OFFSET: u32 = 32;
 const MAX_PERIOD_OFFSET: u32 = 80;
 
-/// Handles the start of the execution of a handle; 0 = the executor selects the next one.
+/// Handles the start of the execution of a handle.
 #[inline(always)]
 pub fn on_executor_execute(handle: u64) {
     let Some(current) = CallContext::count_call() else {
@@ -40,9 +40,7 @@ pub fn on_executor_execute(handle: u64) {
         // SAFETY: a map value pointer checked against null, of the running thread.
         unsafe {
             (*thread).executing_handle = handle;
-            if handle != 0 {
-                (*thread).input = current.handle(0, 0);
-            }
+            (*thread).input = current.handle(0, 0);
         }
     }
 }

@@ -143,8 +143,6 @@ calls! {
     callback_end(callback) { callbacks::on_callback_end(callback); }
     /// `(rcl_timer_t * or rcl_subscription_t *)`.
     rclcpp_executor_execute(handle) { callbacks::on_executor_execute(handle); }
-    /// `()`.
-    rclcpp_executor_get_next_ready() { callbacks::on_executor_execute(0); }
 
     /// `(rcl_node_t *, rmw_node_t *, name, namespace)`.
     rcl_node_init(node, _rmw, name, namespace) {

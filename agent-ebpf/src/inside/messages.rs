@@ -66,6 +66,11 @@ pub fn taken(subscription: u64, source_timestamp: u64, has_message: bool) {
     if !has_message {
         // SAFETY: a map value pointer checked against null.
         atomic_add(unsafe { &raw mut (*figures).failed }, 1);
+        // No callback follows. The next one may be that of a service, which has no execution.
+        if let Some(thread) = current.existing_thread() {
+            // SAFETY: as above, of the running thread.
+            unsafe { (*thread).executing_handle = 0 };
+        }
         return;
     }
     let now = now();

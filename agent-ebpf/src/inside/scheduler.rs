@@ -44,6 +44,10 @@ use crate::{
 
 /// Runs of threads that a CPU remembers; a power of two.
 const RUN_HISTORY_LEN: usize = 64;
+/// Threads whose properties a CPU remembers; a power of two.
+const KNOWN_THREADS: usize = 64;
+/// Time for which the properties of a thread are not read again, in nanoseconds.
+const PROPERTIES_AGE_NS: u64 = 100_000_000;
 /// Waits below this time are not divided among other threads, in nanoseconds.
 const MIN_ATTRIBUTED_WAIT_NS: u64 = 20_000;
 
@@ -58,17 +62,32 @@ mod task_state {
     pub const WAKING: u64 = 0x200;
 }
 
-/// A run of a thread on a CPU.
+/// What is known of a thread.
 #[repr(C)]
 #[derive(Clone, Copy)]
-struct ThreadRun {
-    end_ns: u64,
+struct ThreadIdentity {
     /// Thread id in the low half, process id in the high half.
     id: u64,
     name: [u64; NAME_BYTES / 8],
     /// As in [`Other`].
     cgroup_id: u64,
     priority: i64,
+}
+
+/// A run of a thread on a CPU.
+#[repr(C)]
+#[derive(Clone, Copy)]
+struct ThreadRun {
+    end_ns: u64,
+    thread: ThreadIdentity,
+}
+
+/// A thread that ran on a CPU, and when its properties were read.
+#[repr(C)]
+#[derive(Clone, Copy)]
+struct KnownThread {
+    read_ns: u64,
+    thread: ThreadIdentity,
 }
 
 /// The last runs of a CPU. Only those are present during which a followed thread could run.
@@ -78,6 +97,9 @@ struct RunHistory {
     /// Number of runs so far.
     count: u64,
     runs: [ThreadRun; RUN_HISTORY_LEN],
+    /// Threads of these runs, by the low bits of their ids: to read a thread's properties takes
+    /// longer than all the rest.
+    known: [KnownThread; KNOWN_THREADS],
 }
 
 #[map]
@@ -381,12 +403,29 @@ unsafe fn record_run(runs: *mut RunHistory, id: u64, now: u64) {
             .cast::<ThreadRun>()
             .add(index as usize);
         (*run).end_ns = now;
-        (*run).id = id;
-        bpf_get_current_comm((&raw mut (*run).name).cast(), NAME_BYTES as u32);
-        (*run).cgroup_id = bpf_get_current_cgroup_id();
+        let slot = hide_bounds(id as u32) & (KNOWN_THREADS as u64 - 1);
+        let known = (&raw mut (*runs).known)
+            .cast::<KnownThread>()
+            .add(slot as usize);
+        if (*known).thread.id != id || now - (*known).read_ns > PROPERTIES_AGE_NS {
+            (*known).read_ns = now;
+            read_properties(&raw mut (*known).thread, id);
+        }
+        copy(&raw const (*known).thread, &raw mut (*run).thread);
+    }
+}
+
+/// Reads the properties of the running thread.
+#[inline(always)]
+unsafe fn read_properties(thread: *mut ThreadIdentity, id: u64) {
+    // SAFETY: a map value, by the caller.
+    unsafe {
+        (*thread).id = id;
+        bpf_get_current_comm((&raw mut (*thread).name).cast(), NAME_BYTES as u32);
+        (*thread).cgroup_id = bpf_get_current_cgroup_id();
         let task = bpf_get_current_task();
         let priority = read::<i32>(task_member_address(task, PRIORITY));
-        (*run).priority = priority.map_or(UNKNOWN_PRIORITY, i64::from);
+        (*thread).priority = priority.map_or(UNKNOWN_PRIORITY, i64::from);
     }
 }
 
@@ -415,7 +454,7 @@ unsafe fn attribute_wait(activity: *mut Activity, runs: *const RunHistory, since
             let start_ns = read_volatile(&raw const (*all.add(previous_index as usize)).end_ns);
             let start_ns = select(less_mask(start_ns, since), since, start_ns);
             let ran_ns = end_ns.wrapping_sub(start_ns);
-            let id = read_volatile(&raw const (*run).id);
+            let id = read_volatile(&raw const (*run).thread.id);
             let slot = hide_bounds(id as u32) & (OTHERS as u64 - 1);
             let others = (&raw mut (*activity).others).cast::<Other>();
             let other = others.add(slot as usize).cast::<u64>();
@@ -429,15 +468,15 @@ unsafe fn attribute_wait(activity: *mut Activity, runs: *const RunHistory, since
             );
             write_volatile(other.add(1), select(new_mask, id, known_id));
             let update_mask = new_mask | same_mask;
-            let name = (&raw const (*run).name).cast::<u64>();
+            let name = (&raw const (*run).thread.name).cast::<u64>();
             let (low, high) = (read_volatile(name), read_volatile(name.add(1)));
             let (known_low, known_high) =
                 (read_volatile(other.add(2)), read_volatile(other.add(3)));
             write_volatile(other.add(2), select(update_mask, low, known_low));
             write_volatile(other.add(3), select(update_mask, high, known_high));
             let (cgroup_id, priority) = (
-                read_volatile(&raw const (*run).cgroup_id),
-                read_volatile(&raw const (*run).priority) as u64,
+                read_volatile(&raw const (*run).thread.cgroup_id),
+                read_volatile(&raw const (*run).thread.priority) as u64,
             );
             let (known_cgroup_id, known_priority) =
                 (read_volatile(other.add(4)), read_volatile(other.add(5)));

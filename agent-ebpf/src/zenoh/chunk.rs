@@ -5,14 +5,18 @@ use aya_ebpf::{
     bindings::__sk_buff,
     helpers::generated::{bpf_sk_fullsock, bpf_skb_load_bytes, bpf_tcp_sock},
 };
-use core::{mem::size_of, ptr::read_volatile};
+use core::{
+    mem::size_of,
+    ptr::{read_volatile, write_volatile},
+};
 use ros2probe_wire::{
     filter::Counter,
-    host::{Link, PIECE_BYTES, Piece, chunk as chunk_flag},
+    host::{Layout, Link, PIECE_BYTES, Piece, chunk as chunk_flag},
     record::flag,
 };
 
 use crate::{
+    kernel_memory::{layout_entry, read_member},
     maps::{PIECES, PieceBuffer, WAKE_PIECE_BYTES, count, piece_buffer},
     packet::IPV4_MAPPED,
     pieces::bounded_piece_len,
@@ -191,6 +195,21 @@ fn fill_chunk_header(piece: &mut Piece, this: &Segment, offset: u32) {
     };
 }
 
+/// Returns the period of a time, in which the state of a connection is passed on once.
+#[inline(always)]
+pub fn link_report_period(now: u64) -> u32 {
+    (now >> 30) as u32
+}
+
+/// Returns the sequence number after the last byte that was written to the socket at `address`.
+#[inline(always)]
+fn written_seq(address: u64) -> Option<u32> {
+    if layout_entry(Layout::TcpWritten) == Layout::ABSENT {
+        return None;
+    }
+    read_member(address, Layout::TcpWritten)
+}
+
 /// Passes on the sender's state of the connection, at most once in 2^30 nanoseconds. Within a host
 /// there is no link.
 #[unsafe(export_name = "zenoh_link")]
@@ -199,7 +218,7 @@ pub extern "C" fn write_link_state(skb: *mut __sk_buff, slot: u32) -> u32 {
     let (Some(mut this), Some(mut buffer)) = (segment(slot), piece_buffer(slot)) else {
         return 0;
     };
-    let period = (this.now >> 30) as u32;
+    let period = link_report_period(this.now);
     if this.key.outgoing != 1 || this.interface == LOOPBACK || this.state.last_link_report == period
     {
         return 0;
@@ -220,17 +239,37 @@ pub extern "C" fn write_link_state(skb: *mut __sk_buff, slot: u32) -> u32 {
     if tcp.is_null() {
         return 0;
     }
+    // The kernel counts the segment only after this program.
+    let end = this.sequence_number.wrapping_add(this.len);
     // SAFETY: a socket of TCP, checked against null; the verifier rewrites each read.
-    let state = unsafe {
+    let (mut state, next) = unsafe {
         let next = read_volatile(&raw const (*tcp).snd_nxt);
+        let next = if end.wrapping_sub(next) as i32 > 0 {
+            end
+        } else {
+            next
+        };
         let acknowledged = read_volatile(&raw const (*tcp).snd_una);
-        Link {
+        let state = Link {
             smoothed_rtt: read_volatile(&raw const (*tcp).srtt_us) >> 3,
             retransmitted: read_volatile(&raw const (*tcp).total_retrans),
             sent: read_volatile(&raw const (*tcp).data_segs_out),
             unacknowledged: next.wrapping_sub(acknowledged),
-        }
+            unsent: 0,
+            unsent_known: 0,
+        };
+        (state, next)
     };
+    // The verifier permits no arithmetic on the pointer, and forgets that a value of a map is one.
+    // SAFETY: a field of the slot's memory.
+    let address = unsafe {
+        write_volatile(&raw mut this.socket_address, socket as u64);
+        read_volatile(&raw const this.socket_address)
+    };
+    if let Some(written) = written_seq(address) {
+        state.unsent = written.wrapping_sub(next);
+        state.unsent_known = 1;
+    }
     // The window holds no bytes of the segment any more.
     this.window_len = 0;
     fill_chunk_header(&mut buffer.piece, &this, 0);

@@ -9,6 +9,7 @@
 //! The bytes of a connection that is not recognized stay in the kernel, except on configured ports
 //! of Zenoh:
 //!
+//! - Of a client's hello of TLS on any port, the addresses are passed on, and no byte.
 //! - At a socket, these bytes are passed on: the first 16 of a hello of TLS, and the first 512 of
 //!   an INIT of another version of Zenoh. Of each Initial packet of QUIC ([`quic`]), 6 bytes are.
 //! - On an interface, every TCP frame with payload, SYN, FIN or RST is kept as a whole, of any
@@ -34,7 +35,7 @@ use crate::{
     packet::{IPV4_MAPPED, hook, load_bytes},
     settings::read_global,
 };
-use state::{CONNECTIONS, Key, Segment, ZENOH_PORTS};
+use state::{CONNECTIONS, Direction, Key, Segment, ZENOH_PORTS};
 
 /// Index of the loopback interface, in every network namespace (`LOOPBACK_IFINDEX` of Linux).
 const LOOPBACK: u32 = 1;
@@ -71,7 +72,9 @@ pub fn process_socket_segment(skb: *mut __sk_buff, at: u32) -> Option<()> {
         return None;
     }
     let header = parse_tcp_header(skb, 0)?;
-    if header.flags & SYN != 0 || header.payload_len == 0 && header.flags & (FIN | RST) == 0 {
+    let is_bare = header.payload_len == 0 && header.flags & (FIN | RST) == 0;
+    // A sender whose peer has closed the window sends segments without bytes.
+    if header.flags & SYN != 0 || is_bare && (at != hook::EGRESS || interface == LOOPBACK) {
         return None;
     }
     let outgoing = u32::from(at == hook::EGRESS);
@@ -96,6 +99,9 @@ pub fn process_socket_segment(skb: *mut __sk_buff, at: u32) -> Option<()> {
         if !is_rtps {
             return None;
         }
+    }
+    if is_bare && !is_link_report_due(direction) {
+        return None;
     }
     if is_known {
         state::track_socket(key.socket);
@@ -128,6 +134,18 @@ pub fn process_socket_segment(skb: *mut __sk_buff, at: u32) -> Option<()> {
     }
     release_slot(slot);
     Some(())
+}
+
+/// Returns whether the state of this connection is to be passed on.
+#[inline(always)]
+fn is_link_report_due(direction: Option<*mut Direction>) -> bool {
+    let Some(direction) = direction else {
+        return false;
+    };
+    // SAFETY: no preconditions.
+    let period = chunk::link_report_period(unsafe { bpf_ktime_get_ns() });
+    // SAFETY: a map value pointer checked against null.
+    unsafe { (*direction).last_link_report != period }
 }
 
 /// Handles one frame on an interface; returns 1 to keep it. `slot` is claimed.

@@ -87,6 +87,14 @@ pub extern "C" fn probe_at_socket(skb: *mut __sk_buff, slot: u32) -> u32 {
             found_rtps();
             insert_direction(slot, this, mode::SYNCHRONIZED)
         }
+        Beginning::ClientHello => {
+            // User space knows the announced ports of RTPS. It needs no byte of the connection.
+            init_direction(slot, 0);
+            this.state.protocol = protocol::RTPS;
+            let lengths = u64::from(this.len);
+            chunk::write_chunk(skb, slot, 0, lengths, u32::from(chunk_flag::CLIENT_HELLO));
+            0
+        }
         Beginning::OtherVersion | Beginning::Tls => {
             init_direction(slot, u32::from(chunk_flag::SYN));
             let full_len = if payload_start == Beginning::Tls {
@@ -132,6 +140,7 @@ pub extern "C" fn probe_on_interface(skb: *mut __sk_buff, slot: u32) -> u32 {
     let is_certain = match payload_start {
         Beginning::Init | Beginning::KeepAlive => true,
         Beginning::Frame => rtps::starts_frame(skb, this.body, this.len),
+        Beginning::ClientHello => false,
         _ => extend_candidate(skb, slot) != 0,
     };
     if !is_certain {

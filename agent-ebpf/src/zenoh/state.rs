@@ -207,6 +207,8 @@ pub struct Segment {
     pub lane: u32,
     /// Sequence number in the lane.
     pub lane_sequence_number: u32,
+    /// Address of the sending socket, while its state is read.
+    pub socket_address: u64,
 }
 
 /// Returns whether a connection of RTPS was found on this host.

@@ -163,12 +163,6 @@ pub enum Diagnosis<'a> {
         /// Backends that the publisher shares with a subscription.
         backends: Vec<Cow<'a, str>>,
     },
-    /// Participants with different addresses announce one machine id: Fast DDS sends their messages
-    /// to shared memory only.
-    SharedMachineId {
-        /// GUID of one participant of each set of addresses.
-        participants: Vec<String>,
-    },
     /// TCP retransmits many segments on the way to another host.
     LossyLink {
         /// Address of the sender.
@@ -179,6 +173,8 @@ pub enum Diagnosis<'a> {
         destination: IpAddr,
         /// Share of segments retransmitted when the problem appeared.
         retransmitted_ratio: f64,
+        /// Bytes that waited to be sent then; null if the kernel does not show them.
+        unsent_bytes: Option<u64>,
     },
     /// A node logs errors in a burst: at least ten in a minute, or a fatal one.
     LogErrors {
@@ -312,7 +308,6 @@ impl Diagnosis<'_> {
             Self::ObservationSuspended { .. } => "observation_suspended",
             Self::RestampingNode { .. } => "restamping_node",
             Self::BuffersByCpu { .. } => "buffers_by_cpu",
-            Self::SharedMachineId { .. } => "shared_machine_id",
             Self::LossyLink { .. } => "lossy_link",
             Self::LogErrors { .. } => "log_errors",
             Self::DiagnosticError { .. } => "diagnostic_error",

@@ -34,7 +34,8 @@ pub enum KeptNoun {
     Nodes,
     /// `/graph`.
     Graph,
-    /// Details of each topic, without measurements and histograms.
+    /// Details of each topic, without measurements and histograms; not of the topics of services and
+    /// of discovery.
     Topics,
 }
 

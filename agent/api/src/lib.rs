@@ -25,6 +25,7 @@ pub mod diagnostics;
 pub mod doctor;
 pub mod endpoints;
 pub mod events;
+pub mod fleet;
 pub mod graph;
 pub mod health;
 pub mod history;

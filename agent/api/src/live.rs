@@ -53,6 +53,9 @@ pub struct Open {
     /// Whether the agent keeps a history of the last days (`/history`).
     #[serde(default)]
     pub keeps_history: bool,
+    /// Whether the agent has the view of a fleet (`/fleet`).
+    #[serde(default)]
+    pub has_fleet: bool,
     /// Meaning of the bits of a topic's flags, starting with the lowest bit.
     pub flags: Vec<Cow<'static, str>>,
     /// Meaning of the bits of passages, starting with the lowest bit.
@@ -90,8 +93,9 @@ pub struct Graph<'a> {
     pub subscriptions: Vec<Endpoint<'a>>,
 }
 
-/// `[id, GUID, domain, implementation, host, process id, process, control group]`. Each of the last
-/// four is null when unknown.
+/// `[id, GUID, domain, implementation, host, process id, process, control group, container]`. Each
+/// of the last five is null when unknown. The last one is `container` with the first digits of the
+/// id, or the systemd service; null for other control groups.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveParticipant))]
 pub struct Participant<'a>(
@@ -103,6 +107,7 @@ pub struct Participant<'a>(
     pub Option<u32>,
     pub Option<Cow<'a, str>>,
     pub Option<Cow<'a, str>>,
+    #[serde(default)] pub Option<Cow<'a, str>>,
 );
 
 /// `[id, domain, name, ids of its participants, 1 if hidden]`.

@@ -21,6 +21,9 @@ pub struct ParticipantList<'a> {
     pub unknown_writers: Vec<UnknownWriter<'a>>,
     /// TCP connections that carry RTPS or Zenoh to other hosts, by pair of addresses.
     pub links: Vec<Link<'a>>,
+    /// TCP connections of RTPS that were encrypted with TLS, since the agent started. Their messages
+    /// cannot be read.
+    pub tls_connections: u64,
 }
 
 /// The TCP connections of one protocol from an address of this host to another host.
@@ -47,6 +50,9 @@ pub struct Link<'a> {
     pub retransmitted_segments: u64,
     /// Bytes that were sent and are not acknowledged.
     pub unacknowledged_bytes: u64,
+    /// Bytes that applications of this host wrote and that its kernel has not sent yet; null if the
+    /// kernel does not show them.
+    pub unsent_bytes: Option<u64>,
 }
 
 /// A DDS participant or a Zenoh session.

@@ -29,6 +29,8 @@ pub enum Code {
     NoHistory,
     /// The agent replays no capture.
     NoReplay,
+    /// The agent has no engine of a fleet.
+    NoFleet,
     /// The name exists several times; the request must select one of them.
     Ambiguous,
     /// The path exists, but not with this method.
@@ -133,6 +135,7 @@ impl Code {
             Self::NoSuchNode => ("no-such-node", 404, "No such node"),
             Self::NoHistory => ("no-history", 404, "No history"),
             Self::NoReplay => ("no-replay", 404, "No replay"),
+            Self::NoFleet => ("no-fleet", 404, "No fleet"),
             Self::Ambiguous => ("ambiguous", 409, "The name is ambiguous"),
             Self::MethodNotAllowed => ("method-not-allowed", 405, "Method not allowed"),
             Self::WatchDiffers => ("watch-differs", 409, "Watched with other settings"),

@@ -53,6 +53,13 @@ pub struct TransformEdge<'a> {
     /// Transforms per second over the last ten; absent in the first second, and for a static edge.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rate_hz: Option<f64>,
+    /// Longest of the latest times between two transforms; each transform shortens it by an eighth,
+    /// until a longer one follows. Absent before the second transform, and for a static edge.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "openapi", schema(nullable = false))]
+    pub longest_interval_seconds: Option<f64>,
+    /// Sudden changes of the edge that were seen since its broadcasters appeared.
+    pub jumps: TransformJumps,
     /// Unix time at which the last transform was seen.
     pub timestamp_seconds: f64,
     /// Seconds of its stamp.
@@ -63,6 +70,19 @@ pub struct TransformEdge<'a> {
     pub translation: [f64; 3],
     /// Quaternion: x, y, z and w.
     pub rotation: [f64; 4],
+}
+
+/// Numbers of sudden changes of an edge, by kind.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+pub struct TransformJumps {
+    /// Jumps of the position.
+    pub translation: u64,
+    /// Jumps of the orientation.
+    pub rotation: u64,
+    /// Stamps before the last one of the same broadcaster.
+    pub time: u64,
 }
 
 /// A node that broadcasts an edge.

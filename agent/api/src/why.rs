@@ -33,11 +33,12 @@ pub struct Cause<'a> {
     /// `callback`. The first three end when the message is sent, arrives at the subscriber's
     /// socket, and is received there. `receive` ends when a thread of the middleware wakes the
     /// executor. The others end when the call starts, and when it ends. Only messages through UDP
-    /// sockets have `network` and `socket`, and only others have `receive`.
+    /// sockets have `network` and `socket`. Others have `receive`. A message that waited for the
+    /// retransmission of an earlier one has both, and its `receive` ends when that one arrives.
     pub stage: Cow<'a, str>,
     /// `cpu`, `stolen`, `throttled`, `runnable`, `lock`, `sleep`, `disk`, `page_fault`, `stopped`,
     /// `system_call`, `blocked`, `other_callback`, `arrival`, `send`, `transit`,
-    /// `queue`, `middleware` or `unexplained`.
+    /// `repaired`, `queue`, `middleware` or `unexplained`.
     pub cause: Cow<'a, str>,
     /// Name of the thread that ran instead, released the lock, continued the process, or sent the
     /// message; null for other causes.

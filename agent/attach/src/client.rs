@@ -556,6 +556,10 @@ mod tests {
         let set = unsafe { libc::sigaction(libc::SIGUSR1, &raw const action, before) };
         assert_eq!(set, 0);
         let (mut broker, other) = child();
+        // A busy machine sends the signals late.
+        let long = Some(Duration::from_secs(60));
+        let socket = broker.socket.as_ref().unwrap();
+        set_socket_timeout(socket, Timeout::Recv, long).unwrap();
         // SAFETY: no preconditions.
         let waiting = unsafe { libc::pthread_self() };
         let interrupter = thread::spawn(move || {

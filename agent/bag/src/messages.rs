@@ -107,6 +107,21 @@ pub fn is_bag(path: &Path) -> bool {
     path.is_dir() || begin_of(path).is_ok_and(|begin| storage(path, &begin).is_some())
 }
 
+/// Checks that a file of the bag exists and belongs to a storage of rosbag2. Messages are not read.
+///
+/// # Errors
+/// Fails with the error of the first file if this holds for no file.
+pub fn check(path: &Path) -> Result<(), MessagesError> {
+    let mut first = None;
+    for file in files_of(path)?.0 {
+        match storage_of(&file) {
+            Ok(_) => return Ok(()),
+            Err(error) => first = first.or(Some(error)),
+        }
+    }
+    first.map_or(Ok(()), Err)
+}
+
 /// A topic of a bag, as far as the bag describes it apart from its messages.
 #[derive(Clone, PartialEq, Eq, Debug, Default)]
 pub struct Topic {
@@ -144,10 +159,7 @@ pub fn topics(path: &Path) -> Vec<Topic> {
     for topic in metadata.into_iter().flat_map(|metadata| metadata.topics) {
         topics.insert(topic.name.clone(), Topic::from(topic));
     }
-    let files = match path.is_dir() {
-        true => files_of(path).map_or_else(|_| Vec::new(), |(files, _)| files),
-        false => vec![path.to_owned()],
-    };
+    let files = files_of(path).map_or_else(|_| Vec::new(), |(files, _)| files);
     for file in files {
         let Ok(Some(contents)) = Contents::of_summary(&file) else {
             continue;
@@ -218,10 +230,7 @@ fn read_until(
     extent: Extent,
     each: &mut Visitor<'_>,
 ) -> Result<Read, MessagesError> {
-    let (files, total) = match path.is_dir() {
-        true => files_of(path)?,
-        false => (vec![path.to_owned()], None),
-    };
+    let (files, total) = files_of(path)?;
     let mut result = Read::default();
     let mut failed = None;
     let mut is_any_read = false;
@@ -310,8 +319,15 @@ fn begin_of(path: &Path) -> io::Result<Vec<u8>> {
     Ok(begin)
 }
 
-/// Returns the files of a bag in order, and its number of messages.
-fn files_of(directory: &Path) -> Result<(Vec<PathBuf>, Option<u64>), MessagesError> {
+/// Returns the files of a bag in order, and its number of messages, if metadata.yaml has it.
+fn files_of(path: &Path) -> Result<(Vec<PathBuf>, Option<u64>), MessagesError> {
+    match path.is_dir() {
+        true => files_in(path),
+        false => Ok((vec![path.to_owned()], None)),
+    }
+}
+
+fn files_in(directory: &Path) -> Result<(Vec<PathBuf>, Option<u64>), MessagesError> {
     let wrong = |source| MessagesError::Io {
         path: directory.to_owned(),
         source,
@@ -364,18 +380,22 @@ fn read_file(
     extent: Extent,
     each: &mut dyn FnMut(&Message<'_>) -> ControlFlow<()>,
 ) -> Result<Vec<Fault>, MessagesError> {
+    match storage_of(path)? {
+        Storage::Mcap => read_mcap(path, expansion, each).map_err(|error| match error {
+            ReadError::Io { path, source } => MessagesError::Io { path, source },
+            ReadError::NotMcap(path) => MessagesError::Unknown(path),
+        }),
+        Storage::Sqlite3 => read_sqlite3(path, extent, each),
+    }
+}
+
+/// Returns the storage of a file.
+fn storage_of(path: &Path) -> Result<Storage, MessagesError> {
     let begin = begin_of(path).map_err(|source| MessagesError::Io {
         path: path.to_owned(),
         source,
     })?;
-    match storage(path, &begin) {
-        Some(Storage::Mcap) => read_mcap(path, expansion, each).map_err(|error| match error {
-            ReadError::Io { path, source } => MessagesError::Io { path, source },
-            ReadError::NotMcap(path) => MessagesError::Unknown(path),
-        }),
-        Some(Storage::Sqlite3) => read_sqlite3(path, extent, each),
-        None => Err(MessagesError::Unknown(path.to_owned())),
-    }
+    storage(path, &begin).ok_or_else(|| MessagesError::Unknown(path.to_owned()))
 }
 
 fn read_mcap(

@@ -4,6 +4,7 @@
 //! The table walks the version 2 hierarchy for new numbers, and remembers the results, including
 //! numbers without a directory. A walk is bounded in directories and depth, and opens no file.
 
+use std::borrow::Cow;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::os::unix::fs::DirEntryExt as _;
@@ -67,6 +68,18 @@ pub fn short_name(path: &str) -> &str {
         .or_else(|| parts().find(|part| part.ends_with(".service") || part.ends_with(".scope")))
         .or_else(|| parts().next())
         .unwrap_or("/")
+}
+
+/// Returns the container or the systemd service of a path: `container 0123456789ab`, or
+/// `robot.service`; `None` for other groups.
+#[must_use]
+pub fn container_or_service(path: &str) -> Option<Cow<'_, str>> {
+    let parts = || path.rsplit('/');
+    let service = || parts().find(|part| part.ends_with(".service"));
+    match parts().find_map(container) {
+        Some(id) => Some(Cow::Owned(format!("container {id}"))),
+        None => service().map(Cow::Borrowed),
+    }
 }
 
 /// Returns the shortened id of `docker-<id>.scope`, `cri-containerd-<id>.scope` or `<id>`; `None`
@@ -162,6 +175,8 @@ mod tests {
             format!("/machine.slice/libpod-{id}.scope/container"),
         ] {
             assert_eq!(short_name(&path), short, "{path}");
+            let shown = container_or_service(&path);
+            assert_eq!(shown.as_deref(), Some("container 0123456789ab"), "{path}");
         }
         for (path, name) in [
             ("/", "/"),
@@ -175,6 +190,8 @@ mod tests {
             ("/robots/0123456789abcdef", "0123456789abcdef"),
         ] {
             assert_eq!(short_name(path), name);
+            let service = Some(name).filter(|name| name.ends_with(".service"));
+            assert_eq!(container_or_service(path).as_deref(), service, "{path}");
         }
     }
 }

@@ -208,6 +208,11 @@ impl FilterReader {
                 }
                 continue;
             }
+            if piece.flags & flag::STREAM != 0 && piece.chunk & chunk::CLIENT_HELLO != 0 {
+                let chunk = Chunk::of_piece(&piece, &[], Timestamp(0));
+                observer.input(Input::ClientHello(chunk.stream.flow));
+                continue;
+            }
             if piece.flags & flag::STREAM != 0 {
                 let chunk = Chunk::of_piece(&piece, bytes, clocks.wall_time_of(piece.time));
                 if piece.chunk & chunk::QUIC != 0 {

@@ -423,6 +423,8 @@ impl LiveSource {
                 milliseconds,
                 "the system's clock was set, or the system slept"
             );
+            // Times of earlier rounds are those of the clock before.
+            self.take_rounds(Timestamp(u64::MAX), observer);
             observer.input(Input::ClockSet(step));
         }
         let held_up = clocks.monotonic.saturating_sub(self.clocks.monotonic) >= MAX_ROUND_GAP;
@@ -444,17 +446,9 @@ impl LiveSource {
             wire.poll(&clocks, at_sockets, observer)?;
             settle = settle.max(wire_tap::SETTLE_NANOSECONDS);
         }
-        for round in self.inside.iter().flat_map(Inside::take) {
-            observer.input(Input::Inside(round.report));
-            for publication in &round.publications {
-                observer.input(Input::CausalPublication(publication));
-            }
-            if round.is_last {
-                observer.input(Input::InsideDetached);
-            }
-        }
-        self.apply_wanted(clocks.monotonic, observer);
         self.clock = Timestamp(clocks.now.0.saturating_sub(settle));
+        self.take_rounds(self.clock, observer);
+        self.apply_wanted(clocks.monotonic, observer);
         self.report_view(held_up, observer);
         // Any message renews a lease. If this process did not read its rings for a long time, the
         // announcements may not have fit.
@@ -525,6 +519,21 @@ impl LiveSource {
         }
         for wire in &mut self.wires {
             wire.drain(&clocks, observer);
+        }
+        self.take_rounds(Timestamp(u64::MAX), observer);
+    }
+
+    /// Passes rounds of calls to the model, up to the time until which it has the records: a call
+    /// follows its message.
+    fn take_rounds(&self, until: Timestamp, observer: &mut Observer) {
+        for round in self.inside.iter().flat_map(|inside| inside.take(until)) {
+            observer.input(Input::Inside(round.report));
+            for publication in &round.publications {
+                observer.input(Input::CausalPublication(publication));
+            }
+            if round.is_last {
+                observer.input(Input::InsideDetached);
+            }
         }
     }
 

@@ -99,6 +99,7 @@ const LAYOUT_MEMBERS: [(Layout, &str, &str); Layout::COUNT] = [
     (Layout::PidLevel, "pid", "level"),
     (Layout::PidNumbers, "pid", "numbers"),
     (Layout::PidNumberSize, "upid", ""),
+    (Layout::TcpWritten, "tcp_sock", "write_seq"),
 ];
 
 /// The attached programs; dropping this value detaches them.

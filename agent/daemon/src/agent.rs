@@ -40,7 +40,7 @@ use crate::surface::http::Server;
 use crate::surface::ros2_daemon::Ros2Daemon;
 use crate::surface::{Exposition, Format, MetricSources};
 use crate::watches::Watches;
-use crate::{control, file, memory};
+use crate::{control, file, fleet, memory};
 use ros2probe_metrics::otlp::{
     self, Endpoint, Host, Inputs, NodeLogQueue, NodeLogSink, SpanQueue, SpanSink,
 };
@@ -118,6 +118,8 @@ pub struct Components<'a> {
     pub addresses: Vec<SocketAddr>,
     /// Examines this host for clients.
     pub doctor: Doctor,
+    /// The robots of a fleet.
+    pub fleet: Option<Arc<fleet::Reader>>,
     /// Token that stops the working thread and all streams.
     pub stop: CancellationToken,
 }
@@ -159,6 +161,7 @@ impl<'a> Components<'a> {
             restart: None,
             addresses: Vec::new(),
             doctor,
+            fleet: None,
             stop: CancellationToken::new(),
         }
     }
@@ -251,6 +254,7 @@ impl<'a> Components<'a> {
             ros2_daemon: sources.ros2_daemon,
             page: Arc::new(api::Page::new(self.addresses)),
             doctor: self.doctor,
+            fleet: self.fleet,
             reloader,
             stop: self.stop,
         };
@@ -286,6 +290,9 @@ pub fn run(options: Options) -> Result<()> {
         for restriction in container::restrictions(&config) {
             tracing::warn!("{restriction}");
         }
+    }
+    for token in config.readable_tokens() {
+        tracing::warn!("{token}");
     }
     let mut sources = MetricSources::new(source.kind(), Settings::new(&config));
     if !options.report {
@@ -352,6 +359,9 @@ pub fn run(options: Options) -> Result<()> {
         let started = remote_write::start(settings, inputs, privilege::spawn_export);
         exporters.push(started.context("remote write cannot start")?);
     }
+    let fleet = fleet::start(&config.fleet, privilege::spawn_export);
+    let (fleet_thread, fleet) = fleet.context("the view of a fleet cannot start")?.unzip();
+    exporters.extend(fleet_thread);
     let powerless = drop_privileges()?;
     report_listeners(server.as_ref(), &control, viewers.as_ref(), &watches);
 
@@ -379,6 +389,7 @@ pub fn run(options: Options) -> Result<()> {
             .then(|| -> Box<dyn Fn() -> Observer + Send> { Box::new(new_observer) }),
         addresses: page_addresses(&config, &control),
         doctor: options.doctor,
+        fleet,
         stop: stop.clone(),
     };
     let agent = components.assemble().context("recordings.snapshots")?;
@@ -451,6 +462,7 @@ fn with_overrides(configured: &Config, options: &Options) -> Config {
         // the past would write bags among those of the robot, and remove older ones.
         config.recordings.snapshots.clear();
         config.remote_write.url = None;
+        config.fleet.engine = None;
         if let Endpoint::At(_) = config.otlp.endpoint {
             config.otlp.endpoint = Endpoint::Environment;
         }

@@ -29,6 +29,7 @@ pub mod disk_history;
 pub mod escape;
 pub mod events;
 pub mod file;
+pub mod fleet;
 mod latched;
 pub mod limit_facts;
 pub mod logging;

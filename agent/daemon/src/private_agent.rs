@@ -42,6 +42,7 @@ impl PrivateAgent {
         config.otlp.endpoint = Endpoint::Off;
         config.remote_write.url = None;
         config.ship.url = None;
+        config.fleet.engine = None;
         config.state_directory = StateChoice::Off;
         config.history_bytes = 0;
         config.recordings.directory = StateChoice::At(self.directory.join(RECORDINGS_DIRECTORY));
@@ -129,6 +130,7 @@ mod tests {
             "metrics: {listen: '0.0.0.0:17400'}\nfoxglove: {listen: '127.0.0.1:8765'}\n\
              ros2_daemon: on\notlp: {endpoint: 'http://collector:4317'}\n\
              remote_write: {url: 'http://prometheus:9090/api/v1/write'}\n\
+             fleet: {engine: 'http://prometheus:9090'}\n\
              state_directory: /var/lib/ros2probe\n\
              recordings: {max_bytes: 5000000, snapshots: [{name: a, topics: [/a]}]}\n",
         );
@@ -138,6 +140,7 @@ mod tests {
         assert!(!config.ros2_daemon.is_on);
         assert_eq!(config.otlp.endpoint, Endpoint::Off);
         assert_eq!(config.remote_write.url, None);
+        assert_eq!(config.fleet.engine, None);
         assert_eq!(config.state_directory, StateChoice::Off);
         let inside = |name: &str| Path::new("/tmp/ci").join(name);
         assert_eq!(config.api.socket, SocketChoice::At(inside("api.sock")));

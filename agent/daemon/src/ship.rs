@@ -1,7 +1,7 @@
 //! Settings of `rp ship`, from the configuration that it shares with the agent.
 
 use ros2probe_metrics::otlp::Host;
-use ros2probe_ship::{RECORDS_DIRECTORY, Settings, SpaceLimits};
+use ros2probe_ship::{RECORDS_DIRECTORY, Settings, SpaceLimits, StoreSettings};
 
 use crate::config::{Config, StateChoice};
 use crate::memory::{self, RECORDINGS_DIRECTORY};
@@ -42,13 +42,15 @@ pub fn settings(config: &Config) -> Result<Settings, NoShip> {
     let instance = instance.or_else(|| Host::read().name);
     let limits = &config.recordings.limits;
     Ok(Settings {
-        url,
-        endpoint: ship.endpoint.clone(),
-        region: ship.region.clone(),
+        store: StoreSettings {
+            url,
+            endpoint: ship.endpoint.clone(),
+            region: ship.region.clone(),
+            credentials_file: ship.credentials_file.clone(),
+            ca_file: ship.ca_file.clone(),
+            max_bytes_per_second: ship.max_bytes_per_second,
+        },
         instance: instance.ok_or(NoShip::Instance)?,
-        credentials_file: ship.credentials_file.clone(),
-        ca_file: ship.ca_file.clone(),
-        max_bytes_per_second: ship.max_bytes_per_second,
         windows: ship.windows.clone(),
         triggered_always: ship.triggered_always,
         recordings,

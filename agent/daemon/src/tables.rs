@@ -36,6 +36,11 @@ ros2probe_model::tables! {
     ViewerChannels { name: "foxglove.channels", entries: 4096 }
     /// Subscriptions of one viewer
     ViewerSubscriptions { name: "foxglove.subscriptions", entries: 4096, effect: "closed with 1008" }
+    /// Manifests of delivered bags, for the view of a fleet
+    FleetManifests {
+        name: "fleet.manifests", entries: 500, effect: "those of older bags are left out",
+        reported: "`/fleet`",
+    }
     /// Topics that one viewer's status of losses counts apart
     ViewerLosses { name: "foxglove.losses", entries: 64, effect: "only in the sum" }
 }

@@ -24,7 +24,7 @@ use ros2probe_capture::shm::cell::Cell;
 use ros2probe_capture::shm::classifier::MessageClassifier;
 use ros2probe_capture::shm::port::Port;
 use ros2probe_capture::shm::segment::{Buffer, Message};
-use ros2probe_capture::streams::{Chunk, MissingBefore, Streamed, Streams};
+use ros2probe_capture::streams::{Chunk, MissingBefore, Protocol, Streamed, Streams};
 use ros2probe_daemon::config::{Config, Watch, Watchlist};
 use ros2probe_daemon::surface::foxglove::protocol;
 use ros2probe_daemon::surface::ros2_daemon::call::{self, Argument, Call};
@@ -71,8 +71,8 @@ pub fn capture(bytes: &[u8]) {
 }
 
 /// Reads segments of two TCP connections, and passes what they contain to the model. Five bytes
-/// precede each segment: flags, the distance from the next expected byte, how much was not
-/// captured, and the length.
+/// precede each segment: flags, the distance from the next expected byte, how much was not captured
+/// and whether the kernel found a boundary, and the length.
 pub fn stream(bytes: &[u8]) {
     const START: u64 = 1_795_143_000_000_000_000;
     let mut observer = small_observer();
@@ -86,7 +86,7 @@ pub fn stream(bytes: &[u8]) {
         rest = behind;
         now += 1_000_000 << (flags >> 6);
         let direction = usize::from(flags & 3);
-        let length = content.len() as u32 + u32::from(*cut) * 64;
+        let length = content.len() as u32 + u32::from(*cut & 0x3f) * 256;
         let syn = flags & 4 != 0;
         let expected = next.get(direction).copied().unwrap_or_default();
         let number = expected.wrapping_add_signed(i32::from(distance.cast_signed()) * 7);
@@ -99,7 +99,11 @@ pub fn stream(bytes: &[u8]) {
             sequence_number: number,
             syn,
             end: flags & 8 != 0,
-            boundary: None,
+            boundary: match cut >> 6 {
+                1 => Some(Protocol::Zenoh),
+                2 => Some(Protocol::Rtps),
+                _ => None,
+            },
             before: match flags >> 4 & 3 {
                 1 => MissingBefore::Skipped,
                 2 => MissingBefore::Lost,
@@ -140,7 +144,7 @@ fn check(streamed: &Streamed<'_>, now: u64) {
             assert!(bytes.len() as u64 <= u64::from(*length));
             assert!(envelope.time <= now);
         }
-        Streamed::Zenoh(_) | Streamed::Gap(..) => {}
+        Streamed::Zenoh(_) | Streamed::Gap(..) | Streamed::ClientHello(_) => {}
     }
 }
 

@@ -138,10 +138,15 @@ impl Header {
         is_possible.then_some(header)
     }
 
+    /// Returns whether the checksum matches. `bytes` begin with the header.
+    pub(crate) fn is_undamaged(&self, bytes: &[u8]) -> bool {
+        checksum(bytes) == self.checksum
+    }
+
     /// Returns the block of this header and what is stored behind it; `None` if it is damaged.
     /// `bytes` begin with the header.
     pub(crate) fn block(&self, bytes: &[u8]) -> Option<Block> {
-        if checksum(bytes) != self.checksum {
+        if !self.is_undamaged(bytes) {
             return None;
         }
         let mut content = Vec::new();

@@ -123,8 +123,9 @@ impl Blocks {
         }
     }
 
-    /// Returns the latest undamaged block of a kind that ends at `time` or before.
-    pub(crate) fn last(&self, kind: Kind, time: u32) -> Option<Block> {
+    /// Returns the header and the place of the latest undamaged block of a kind that ends at `time`
+    /// or before. Reads what is stored, and does not decompress it.
+    pub(crate) fn last(&self, kind: Kind, time: u32) -> Option<(Header, u64)> {
         let mut reader = Reader::open(&self.path, self.length).ok()?;
         let mut found = Vec::new();
         while let Some((header, place)) = reader.next() {
@@ -133,10 +134,17 @@ impl Blocks {
             }
         }
         found.sort_by_key(|(header, _)| header.end);
-        let latest = found.iter().rev();
-        latest
-            .flat_map(|(header, place)| reader.block(header, *place))
-            .next()
+        let mut latest = found.into_iter().rev();
+        latest.find(|(header, place)| {
+            let stored = reader.stored(header, *place);
+            stored.is_some_and(|stored| header.is_undamaged(&stored))
+        })
+    }
+
+    /// Returns a block; `None` if it is damaged.
+    pub(crate) fn block(&self, header: &Header, place: u64) -> Option<Block> {
+        let mut reader = Reader::open(&self.path, self.length).ok()?;
+        reader.block(header, place)
     }
 }
 
@@ -183,10 +191,15 @@ impl Reader {
 
     /// Returns a block; `None` if it is damaged.
     pub(crate) fn block(&mut self, header: &Header, place: u64) -> Option<Block> {
+        header.block(&self.stored(header, place)?)
+    }
+
+    /// Returns the bytes of a block as they are stored; `None` if they cannot be read.
+    fn stored(&mut self, header: &Header, place: u64) -> Option<Vec<u8>> {
         self.file.seek(SeekFrom::Start(place)).ok()?;
         let mut bytes = Vec::new();
         let length = HEADER_LEN as u64 + u64::from(header.stored);
         (&mut self.file).take(length).read_to_end(&mut bytes).ok()?;
-        header.block(&bytes)
+        Some(bytes)
     }
 }

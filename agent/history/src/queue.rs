@@ -23,6 +23,7 @@ const PLACE_FILE: &str = "place";
 /// Its files consist of blocks with a checksum, as those of a [`Store`](crate::Store); a damaged
 /// one is skipped. A record may depend on the earlier ones of its file, so [`Self::read`] begins
 /// with the first record of a file. After a crash, records that were just removed may wait again.
+/// [`Self::settle`] notes how much of a record is delivered.
 #[derive(Debug)]
 pub struct Queue {
     directory: PathBuf,
@@ -36,6 +37,10 @@ pub struct Queue {
     /// Oldest waiting record, and the next one to read.
     waiting: Place,
     reading: Place,
+    /// The record that was read last.
+    last_read: Place,
+    /// How much of the oldest waiting record is settled.
+    settled: u64,
 }
 
 /// A record.
@@ -49,6 +54,8 @@ pub struct Record {
     pub is_first: bool,
     /// Whether it waits; `false` for one that was removed, on which later ones may depend.
     pub is_waiting: bool,
+    /// How much of it is settled, as [`Queue::settle`] noted.
+    pub settled: u64,
 }
 
 /// Place of a record: number of the file, and bytes from its begin.
@@ -69,7 +76,7 @@ impl Queue {
     /// Fails if the directory cannot be read.
     pub fn open(directory: &Path, limit: u64) -> io::Result<Self> {
         let kept = read_place(directory);
-        let waiting = kept.unwrap_or(Place(0, 0));
+        let (waiting, settled) = kept.unwrap_or((Place(0, 0), 0));
         let mut found = Vec::new();
         match fs::read_dir(directory) {
             Err(error) if error.kind() == io::ErrorKind::NotFound => {}
@@ -99,10 +106,12 @@ impl Queue {
             limit,
             files: files.collect(),
             // Records of a new file all wait, also if the kept place is after the end of its file.
-            next: kept.map_or(next, |kept| next.max(kept.0.saturating_add(1))),
+            next: kept.map_or(next, |(kept, _)| next.max(kept.0.saturating_add(1))),
             continues: false,
             waiting,
             reading: Place(0, FIRST_PLACE),
+            last_read: Place(0, 0),
+            settled,
         };
         // All of the last file may have been delivered.
         queue.remove_read_files();
@@ -221,11 +230,17 @@ impl Queue {
                 while let Some((header, place)) = reader.next() {
                     self.reading.1 = reader.place;
                     if let Some(block) = reader.block(&header, place) {
+                        let of_record = Place(self.reading.0, place);
+                        self.last_read = of_record;
                         return Ok(Some(Record {
                             at: block.end,
                             content: block.content,
                             is_first: place == FIRST_PLACE,
-                            is_waiting: Place(self.reading.0, place) >= self.waiting,
+                            is_waiting: of_record >= self.waiting,
+                            settled: match of_record == self.oldest_waiting() {
+                                true => self.settled,
+                                false => 0,
+                            },
                         }));
                     }
                 }
@@ -237,15 +252,50 @@ impl Queue {
         }
     }
 
+    /// Reads the records that wait once more, from the oldest one on.
+    pub fn rewind(&mut self) {
+        self.reading = self.waiting;
+    }
+
     /// Removes all records that were read.
     pub fn remove(&mut self) {
-        self.waiting = self.waiting.max(self.reading);
+        self.wait_from(self.waiting.max(self.reading));
         self.remove_read_files();
-        // Without this file, the records are delivered again after a restart.
+        self.keep_place();
+    }
+
+    /// Notes how much of the record that was read last is settled, in a unit of the caller. Records
+    /// before it no longer wait: they are damaged. The note lasts until the record is removed or lost.
+    pub fn settle(&mut self, settled: u64) {
+        self.wait_from(self.last_read);
+        self.settled = settled;
+        self.keep_place();
+    }
+
+    /// Writes the place of the oldest waiting record. Without this file, the records are delivered
+    /// again after a restart.
+    fn keep_place(&self) {
         let temporary = self.directory.join("place.new");
         let Place(file, place) = self.waiting;
-        let written = fs::write(&temporary, format!("{file} {place}\n"));
+        let text = match self.settled {
+            0 => format!("{file} {place}\n"),
+            settled => format!("{file} {place} {settled}\n"),
+        };
+        let written = fs::write(&temporary, text);
         let _ = written.and_then(|()| fs::rename(&temporary, self.directory.join(PLACE_FILE)));
+    }
+
+    /// Returns the place of the oldest waiting record.
+    fn oldest_waiting(&self) -> Place {
+        let Place(file, place) = self.waiting;
+        Place(file, place.max(FIRST_PLACE))
+    }
+
+    /// Lets the records before a place no longer wait.
+    fn wait_from(&mut self, place: Place) {
+        if place > self.waiting {
+            (self.waiting, self.settled) = (place, 0);
+        }
     }
 
     /// Deletes the files without a waiting record.
@@ -255,9 +305,10 @@ impl Queue {
             if self.waiting < end {
                 break;
             }
-            self.waiting = self.waiting.max(Place(first.number.saturating_add(1), 0));
+            let after = Place(first.number.saturating_add(1), 0);
             let _ = fs::remove_file(&first.blocks.path);
             self.files.pop_front();
+            self.wait_from(after);
         }
         if self.files.is_empty() {
             self.continues = false;
@@ -282,18 +333,22 @@ impl Queue {
             }
         }
         self.reading = reached.max(Place(number.saturating_add(1), FIRST_PLACE));
-        self.waiting = self.waiting.max(Place(number.saturating_add(1), 0));
+        self.wait_from(Place(number.saturating_add(1), 0));
         if let Some(first) = self.files.pop_front() {
             let _ = fs::remove_file(first.blocks.path);
         }
     }
 }
 
-/// Returns the place of the oldest waiting record, as [`Queue::remove`] keeps it.
-fn read_place(directory: &Path) -> Option<Place> {
+/// Returns the place of the oldest waiting record and how much of it is settled, as
+/// [`Queue::keep_place`] writes them.
+fn read_place(directory: &Path) -> Option<(Place, u64)> {
     let text = fs::read_to_string(directory.join(PLACE_FILE)).ok()?;
-    let (file, place) = text.trim().split_once(' ')?;
-    Some(Place(file.parse().ok()?, place.parse().ok()?))
+    let mut numbers = text.split_whitespace();
+    let file = numbers.next()?.parse().ok()?;
+    let place = numbers.next()?.parse().ok()?;
+    let settled = numbers.next().map_or(Ok(0), str::parse).ok()?;
+    Some((Place(file, place), settled))
 }
 
 /// Returns the number of a file by its name; `None` for other files.

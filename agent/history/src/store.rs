@@ -8,7 +8,7 @@ use std::os::unix::fs::DirBuilderExt as _;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-use crate::block::{Block, Kind};
+use crate::block::{Block, Header, Kind};
 use crate::columns::{self, Name, Row};
 use crate::documents::{Document, DocumentVersion, VersionReader, Versions};
 use crate::file::{Blocks, FIRST_PLACE};
@@ -346,17 +346,29 @@ impl Store {
     /// Returns the latest state of the robot at this time; `None` if no earlier one is kept.
     #[must_use]
     pub fn state(&self, time: u32) -> Option<Block> {
+        let (file, header, place) = self.latest_state(time)?;
+        file.block(&header, place)
+    }
+
+    /// Returns the end of [`Self::state`], which it does not decompress.
+    #[must_use]
+    pub fn state_end(&self, time: u32) -> Option<u32> {
+        self.latest_state(time).map(|(_, header, _)| header.end)
+    }
+
+    /// Returns the file, header and place of the latest state at this time.
+    fn latest_state(&self, time: u32) -> Option<(Blocks, Header, u64)> {
         let tiers = [Tier::Seconds, Tier::Tens];
         let states = tiers.into_iter().filter_map(|tier| {
             let mut files = self.files(tier);
             files.retain(|file| file.begin <= time);
             files.sort_by_key(|file| file.begin);
-            let latest = files.iter().rev();
-            latest
-                .filter_map(|file| file.last(Kind::State, time))
-                .next()
+            files.into_iter().rev().find_map(|file| {
+                let (header, place) = file.last(Kind::State, time)?;
+                Some((file, header, place))
+            })
         });
-        states.max_by_key(|state| state.end)
+        states.max_by_key(|(_, header, _)| header.end)
     }
 
     /// Returns a document as it was at this time; `None` if it was not kept, or is damaged.

@@ -4,7 +4,7 @@
 
 use std::fs;
 
-use ros2probe_history::{Block, Document, Series, Store, Tier, TopicName, TopicRow};
+use ros2probe_history::{Block, Document, Kind, Series, Store, Tier, TopicName, TopicRow};
 
 /// Default of `limits.topics`.
 const TOPICS: u32 = 1000;
@@ -14,6 +14,9 @@ const ALLOWED: u64 = 6 << 10;
 const ALLOWED_FOR_DOCUMENTS: u64 = 14 << 10;
 /// Maximum length of all documents, in bytes.
 const DOCUMENTS: usize = 4 << 20;
+/// Length of a large state, in bytes, and memory for its end, in KiB.
+const STATE: usize = 32 << 20;
+const ALLOWED_FOR_END: u64 = 1 << 10;
 
 fn minute(begin: u32) -> Vec<Series<TopicName, TopicRow>> {
     let series = |topic| Series {
@@ -91,4 +94,27 @@ fn the_largest_documents_are_written_within_the_documented_memory() {
     let most = peak() - before;
     println!("{most} KiB");
     assert!(most <= ALLOWED_FOR_DOCUMENTS, "{most} KiB");
+}
+
+/// Earlier, each answer of a moment decompressed the whole state for its time.
+#[test]
+fn the_end_of_a_state_is_found_without_its_content() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = Store::open(directory.path(), 64 << 20).unwrap();
+    let state = Block {
+        kind: Kind::State,
+        begin: 60,
+        end: 120,
+        content: vec![b' '; STATE],
+    };
+    store.append(Tier::Seconds, &[state]).unwrap();
+    // The peak is now the present size (proc(5)).
+    fs::write("/proc/self/clear_refs", "5").unwrap();
+    let before = peak();
+    assert_eq!(store.state_end(130), Some(120));
+    let most = peak() - before;
+    assert!(most <= ALLOWED_FOR_END, "{most} KiB");
+    assert_eq!(store.state(130).unwrap().content.len(), STATE);
+    let whole = peak() - before;
+    assert!(whole > STATE as u64 >> 10, "{whole} KiB");
 }

@@ -96,6 +96,35 @@ fn a_full_queue_loses_its_oldest_records_and_reports_them() {
 }
 
 #[test]
+fn the_settled_part_of_a_record_is_kept_until_the_record_is_removed_or_lost() {
+    let place = tempfile::tempdir().unwrap();
+    let mut queue = Queue::open(place.path(), LIMIT).unwrap();
+    for number in 0..3 {
+        append(&mut queue, number);
+    }
+    let next = |queue: &mut Queue| {
+        let record = queue.read().unwrap().unwrap();
+        (number(&record), record.settled)
+    };
+    assert_eq!(next(&mut queue), (0, 0));
+    queue.settle(7);
+    assert_eq!(next(&mut queue), (1, 0));
+    queue.rewind();
+    assert_eq!(next(&mut queue), (0, 7));
+    let mut queue = Queue::open(place.path(), LIMIT).unwrap();
+    assert_eq!(next(&mut queue), (0, 7));
+    queue.remove();
+    assert_eq!(next(&mut queue), (1, 0));
+    queue.settle(3);
+    // The file with the record is lost, and with it the settled part.
+    fs::remove_file(place.path().join("0000000000.queue")).unwrap();
+    fs::write(place.path().join("place"), "0 99 3\n").unwrap();
+    let mut queue = Queue::open(place.path(), LIMIT).unwrap();
+    append(&mut queue, 4);
+    assert_eq!(next(&mut queue), (4, 0));
+}
+
+#[test]
 fn files_beyond_the_cap_are_lost() {
     let place = tempfile::tempdir().unwrap();
     let mut queue = Queue::open(place.path(), LIMIT).unwrap();

@@ -11,7 +11,8 @@ use std::path::{Path, PathBuf};
 
 use proptest::prelude::*;
 use ros2probe_history::{
-    Block, Kind, ProcessName, ProcessRow, Series, Store, Tier, TopicName, TopicRow, merged,
+    Block, Document, Kind, ProcessName, ProcessRow, Series, Store, Tier, TopicName, TopicRow,
+    merged,
 };
 
 const LIMIT: u64 = 8 << 20;
@@ -106,8 +107,9 @@ fn rows_exist_at_both_resolutions_after_a_restart() {
         assert_eq!(rows(&store, 60_000..64_500, 10), tens);
         assert_eq!(rows(&store, 60_100..60_102, 1), [row(60_101), row(60_102)]);
         let state = store.state(61_000).unwrap();
-        assert_eq!(state.content, b"state 60900");
-        assert!(store.state(60_059).is_none());
+        assert_eq!((&*state.content, state.end), (&b"state 60900"[..], 60_960));
+        assert_eq!(store.state_end(61_000), Some(60_960));
+        assert!(store.state(60_059).is_none() && store.state_end(60_059).is_none());
         let mut usage = Vec::new();
         store.processes(60_000..64_500, 10, &|_| true, &mut |_, row| usage.push(row));
         assert_eq!(usage.len(), 75);
@@ -260,10 +262,19 @@ fn the_first_write_creates_the_directory_with_owner_only_permissions() {
     let store = Store::open(&directory, LIMIT).unwrap();
     assert!(!directory.exists() && store.facts().seconds.is_none());
     store.append(Tier::Seconds, &minute(60)).unwrap();
-    assert_eq!(
-        fs::metadata(&directory).unwrap().permissions().mode() & 0o777,
-        0o700
-    );
+    let content = Document {
+        name: "logs".into(),
+        content: b"{}".to_vec(),
+    };
+    let documents = std::iter::once(content);
+    store.append_documents(60, 120, documents).unwrap();
+    let mode = |path: &Path| fs::metadata(path).unwrap().permissions().mode() & 0o777;
+    assert_eq!(mode(&directory), 0o700);
+    let files_of_all_tiers = files(&directory);
+    assert_eq!(files_of_all_tiers.len(), 2);
+    for file in files_of_all_tiers {
+        assert_eq!(mode(&file), 0o600, "{}", file.display());
+    }
     assert_eq!(rows(&store, 60..120, 1).len(), 60);
     // Nothing can be created below a file.
     let below = Store::open(&files(&directory)[0].join("history"), LIMIT);
@@ -363,7 +374,11 @@ proptest! {
         let intact = if place < 8 { 0 } else { minutes.saturating_sub(1) };
         prop_assert!(found.len() >= intact * 60, "{} of {place}", found.len());
         prop_assert!(found.iter().all(|found| *found == row(found.at)));
-        let _ = store.state(180);
+        for time in [60, 119, 120, 180] {
+            let state = store.state(time);
+            prop_assert!(state.iter().all(|state| state.end <= time));
+            prop_assert_eq!(store.state_end(time), state.map(|state| state.end));
+        }
     }
 }
 

@@ -119,11 +119,24 @@ enum Target {
     Type(EquivalenceHash),
 }
 
+/// Returns the part of a reply that does not name its request: replies to several participants
+/// differ in the rest alone.
+pub(crate) fn without_request(payload: &[u8]) -> &[u8] {
+    let header = match payload.get(1) {
+        Some(9) => 8,
+        _ => 4,
+    };
+    payload.get(header + REQUEST_IDENTITY..).unwrap_or(payload)
+}
+
 /// Returns the hashes and the bytes of the complete types in a reply. The payload begins with its
 /// encapsulation header. A reply to another request, or with a failure, has none.
 ///
+/// Objects that do not have their hash are left out, because Fast DDS 3.2 leaves bytes between the
+/// fields of some undefined.
+///
 /// # Errors
-/// Fails if the payload is not a reply, or if an object does not have its hash.
+/// Fails if the payload is not a reply, or if no object has its hash.
 pub(crate) fn objects(payload: &[u8]) -> Result<Vec<(EquivalenceHash, &[u8])>, NotUsable> {
     if payload.len() > MAX_REPLY {
         return Err(NotUsable::TooLong);
@@ -158,7 +171,7 @@ pub(crate) fn objects(payload: &[u8]) -> Result<Vec<(EquivalenceHash, &[u8])>, N
     };
     let mut pairs = delimited(&mut types, "types")?;
     let count = pairs.u32("number of types")?;
-    let mut found = Vec::new();
+    let (mut found, mut forged) = (Vec::new(), None);
     for _ in 0..count {
         if found.len() == MAX_TYPES {
             return Err(NotClosed::TooMany.into());
@@ -173,13 +186,16 @@ pub(crate) fn objects(payload: &[u8]) -> Result<Vec<(EquivalenceHash, &[u8])>, N
         let object = delimited(&mut pairs, "type_object")?;
         let bytes = bytes.get(..4 + object.remaining()).unwrap_or_default();
         if kind == EK_COMPLETE {
-            if !Md5::digest(bytes).starts_with(&hash.0) {
-                return Err(NotUsable::Forged(hash));
+            match Md5::digest(bytes).starts_with(&hash.0) {
+                true => found.push((hash, bytes)),
+                false => forged = Some(hash),
             }
-            found.push((hash, bytes));
         }
     }
-    Ok(found)
+    match forged {
+        Some(hash) if found.is_empty() => Err(NotUsable::Forged(hash)),
+        _ => Ok(found),
+    }
 }
 
 impl TypeObject {

@@ -26,7 +26,11 @@ pub struct ExportThread {
 
 impl ExportThread {
     /// Starts a thread, which ends soon after `stop`.
-    pub(crate) fn start(
+    ///
+    /// # Errors
+    ///
+    /// Fails like [`Spawn`].
+    pub fn start(
         name: &str,
         stop: CancellationToken,
         spawn: Spawn,

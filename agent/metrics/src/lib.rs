@@ -15,6 +15,7 @@
 #![forbid(unsafe_code)]
 
 pub mod catalogue;
+mod connector;
 pub mod event;
 mod exemplar_lines;
 pub mod export_thread;

@@ -29,7 +29,7 @@ impl File {
 }
 
 /// Every file, by its path below `/page/`; `index.html` is also served at `/`.
-pub static FILES: [File; 45] = [
+pub static FILES: [File; 46] = [
     File::new("api.js", SCRIPT_TYPE, include_bytes!("../api.js")),
     File::new("app.css", CSS_TYPE, include_bytes!("../app.css")),
     File::new("app.js", SCRIPT_TYPE, include_bytes!("../app.js")),
@@ -113,6 +113,11 @@ pub static FILES: [File; 45] = [
         "views/events.js",
         SCRIPT_TYPE,
         include_bytes!("../views/events.js"),
+    ),
+    File::new(
+        "views/fleet.js",
+        SCRIPT_TYPE,
+        include_bytes!("../views/fleet.js"),
     ),
     File::new(
         "views/graph.js",

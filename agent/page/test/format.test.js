@@ -103,16 +103,6 @@ test('the last message of a publisher is kept, or the reason is given', () => {
   assert.equal(format.lastMessage({ state: 'of a newer agent', bytes: null }), 'of a newer agent');
 });
 
-test('a control group is named by its container or its unit', () => {
-  const id = '0123456789ab'.padEnd(64, 'c');
-  for (const path of [`/system.slice/docker-${id}.scope`, `/docker/${id}/system.slice/x.service`,
-    `/kubepods.slice/cri-containerd-${id}.scope`, `/machine.slice/libpod-${id}.scope/container`]) {
-    assert.equal(format.groupOf(path), 'container 0123456789ab', path);
-  }
-  assert.equal(format.groupOf('/system.slice/robot.service/nodes'), 'robot.service');
-  for (const path of ['/', '/user.slice/session-3.scope', `/${id}0`, null]) assert.equal(format.groupOf(path), '');
-});
-
 test('every event of the documentation has words', () => {
   const rows = readFileSync(new URL('../../../docs/events.md', import.meta.url), 'utf8')
     .matchAll(/^\| `(ros2[a-z._]+)` \|/gm);

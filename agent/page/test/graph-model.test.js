@@ -235,12 +235,13 @@ test('containers and units are boxes, and processes have the name of their scrip
     own.process = 'python3';
   }
   const [one, two, three] = [1, 2, 3].map((id) => /** @type {any} */ (state.participants.get(id)));
-  two.cgroup = three.cgroup = `/docker/${'0123456789ab'.padEnd(64, '0')}`;
+  two.cgroup = three.cgroup = '/docker/0123456789abcdef';
+  two.container = three.container = 'container 0123456789ab';
   state.takeProcesses([{ process_id: two.pid, process: 'python3', script: 'robot.py' }]);
   const boxes = () => build(state, { ...ALL, boxes: 'process' }).vertices
     .filter((each) => each.kind === 'box').map((each) => `${each.parent}: ${each.name}`).sort();
   assert.deepEqual(boxes(), ['box:base container 0123456789ab: python3 3',
     'box:base container 0123456789ab: robot.py 2', 'box:base: container 0123456789ab', 'null: base']);
-  one.cgroup = two.cgroup;
+  one.container = two.container;
   assert.deepEqual(boxes(), ['box:base: python3 3', 'box:base: robot.py 2', 'null: base']);
 });

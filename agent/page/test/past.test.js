@@ -19,8 +19,9 @@ test('a request of the present has its counterpart of the past, or none', () => 
     ['parameters', 'history/moment/parameters?at=1000'],
     ['chains?calls=true&from=%2Fpoints', 'history/moment/chains?at=1000'],
     ['logs?limit=300&level=warn', 'history/moment/logs?at=1000'],
-    ['topics/%2Fimu?domain_id=0', 'history/moment/topics?at=1000'],
-    ['nodes/robot%2Flidar', 'history/moment/nodes?at=1000'],
+    ['topics/%2Fimu?domain_id=0', 'history/moment/topics?at=1000&name=%2Fimu&domain_id=0'],
+    ['topics/a%26at%3D1', 'history/moment/topics?at=1000&name=a%26at%3D1'],
+    ['nodes/robot%2Flidar', 'history/moment/nodes?at=1000&name=robot%2Flidar'],
     ['processes', 'history/processes?from=880&to=1000'],
     ['recordings', null], ['doctor', null], ['snapshots', null],
     ['why?from=a&history=true', null], ['inside?name=%2Fimu', null],
@@ -37,12 +38,12 @@ test('logs of the past are filtered as the agent filters those of the present', 
   assert.deepEqual(levels('logs?limit=300&level=error'), ['fatal', 'error']);
 });
 
-test('a topic or node is found by name and domain, or the request fails as in the present', () => {
-  const topics = { topics: [{ domain_id: 0, name: '/imu', dds_name: 'rt/imu' }, { domain_id: 1, name: '/imu', dds_name: 'rt/imu' },
-    { domain_id: 0, name: 'raw', dds_name: 'raw' }] };
-  assert.equal(of('topics/%2Fimu?domain_id=1', topics).domain_id, 1);
-  assert.equal(of('topics/raw?domain_id=0', topics).name, 'raw');
-  assert.throws(() => of('topics/%2Fother', topics), { status: 404 });
+test('a topic or node of the past is the one of its name, or the request fails as in the present', () => {
+  const topics = { topics: [{ name: '/go', kind: 'service_request' }, { name: '/go', kind: 'topic', types: ['a'] },
+    { name: '/go', kind: 'service_reply' }] };
+  assert.deepEqual(of('topics/%2Fgo?domain_id=0', topics), topics.topics[1]);
+  assert.equal(of('topics/%2Fgo', { topics: topics.topics.slice(2) }).kind, 'service_reply');
+  assert.throws(() => of('topics/%2Fother', { topics: [] }), { status: 404 });
   const named = (/** @type {string} */ name) => ({ name, types: [] });
   const nodes = { nodes: [{ domain_id: 0, name: '/robot/lidar', publishers: [named('/points'), named('/go/_action/status')],
     subscriptions: [], services: [named('/_hidden')], clients: [] }] };

@@ -4,7 +4,7 @@ import { test } from 'node:test';
 globalThis.document = /** @type {any} */ ({ addEventListener() {}, baseURI: 'http://x/' });
 globalThis.window = /** @type {any} */ ({ addEventListener() {} });
 globalThis.location = /** @type {any} */ ({ hash: '' });
-const { changesOf, jumpsOf, linesOf, Minutes, partsOf, Rates, stampAge } = await import('../views/robot.js');
+const { changesOf, extrapolation, jumpsOf, jumpWords, linesOf, Minutes, partsOf, Rates, stampAge } = await import('../views/robot.js');
 
 const status = (/** @type {string} */ name, /** @type {string} */ level, topic = '/diagnostics') =>
   ({ domain_id: 0, topic, name, level, hardware_id: '', message: '', values: [] });
@@ -47,6 +47,22 @@ test('jumps of transforms are counted by edge, and stamps have an age', () => {
   assert.equal(stampAge(edge(100.25)), -0.25);
   assert.equal(stampAge(edge(100.75, true)), null);
   assert.equal(stampAge(edge(1.7e9)), null);
+  assert.equal(jumpWords({ translation: 12, rotation: 0, time: 2 }), '12 position, 2 time');
+  assert.equal(jumpWords({ translation: 0, rotation: 0, time: 0 }), '0');
+  assert.equal(jumpWords(undefined), '–');
+});
+
+test('a lookup for the present exceeds the latest transform by its age and the time to the next one', () => {
+  const edge = { is_static: false, timestamp_seconds: 100.75, stamp_sec: 100, stamp_nanosec: 500_000_000,
+    longest_interval_seconds: 0.5 };
+  assert.equal(extrapolation(edge, 101), 0.75);
+  // It is silent for longer than usual.
+  assert.equal(extrapolation(edge, 102.75), 2.25);
+  // A stamp ahead of its arrival covers a part of the interval, or all of it.
+  assert.equal(extrapolation({ ...edge, stamp_nanosec: 1_000_000_000 }, 101), 0.25);
+  assert.equal(extrapolation({ ...edge, stamp_sec: 102 }, 101), 0);
+  assert.equal(extrapolation({ ...edge, is_static: true }, 101), null);
+  assert.equal(extrapolation({ ...edge, timestamp_seconds: 1.7e9 }, 1.7e9), null);
 });
 
 test('messages of logs are counted by minute, first as kept, then as the counts grow', () => {

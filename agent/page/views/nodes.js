@@ -2,7 +2,7 @@
 
 import { useRef } from '../vendor/hooks.mjs';
 import { named } from '../api.js';
-import { bytes, calls, count, date, duration, groupOf, percent, several } from '../format.js';
+import { bytes, calls, count, date, duration, percent, several } from '../format.js';
 import { nodeKey } from '../graph-model.js';
 import { address } from '../router.js';
 import { Chart } from '../chart.js';
@@ -114,7 +114,7 @@ export function Nodes({ query }) {
   const participant = (/** @type {any} */ node) => state.participants.get(node.participants[0]);
   const process = (/** @type {any} */ node) => processOf(participant(node), byId);
   const where = (/** @type {any} */ node) => [state.processName(participant(node)),
-    groupOf(participant(node)?.cgroup)].filter(Boolean).join(', ');
+    participant(node)?.container].filter(Boolean).join(', ');
   const number = (/** @type {any} */ node, /** @type {'publishers'|'subscriptions'} */ side) =>
     joined.get(node.id)?.[side].size ?? 0;
   const worstOf = (/** @type {any} */ node) => {
@@ -136,7 +136,7 @@ export function Nodes({ query }) {
       by: (/** @type {any} */ node) => participant(node)?.host,
       cell: (/** @type {any} */ node) => html`<${Name} text=${participant(node)?.host ?? 'unknown'} />` },
     { key: 'process', title: 'Process',
-      meaning: 'Script or program with its id, and its container or systemd unit.', by: where,
+      meaning: 'Script or program with its id, and its container or systemd service.', by: where,
       cell: (/** @type {any} */ node) => html`<${Name} text=${where(node) || 'unknown'} />` },
     { key: 'cpu', title: 'CPU',
       meaning: 'CPU time by time: 100 % is one busy core. Nodes of one process share the value.', kind: 'number', by: (/** @type {any} */ node) => process(node)?.part,
@@ -183,7 +183,8 @@ function Links() {
     <div class="scroll" tabindex="0" role="group" aria-labelledby="links"><table>
     <thead><tr><th scope="col">From → to</th><th scope="col">Protocol</th>
       <th scope="col" class="number">Connections</th><th scope="col" class="number">Round trip</th>
-      <th scope="col" class="number">Unacknowledged</th><th scope="col" class="number">Segments</th>
+      <th scope="col" class="number">Unsent</th><th scope="col" class="number">Unacknowledged</th>
+      <th scope="col" class="number">Segments</th>
       <th scope="col" class="number">Sent again</th></tr></thead>
     <tbody>${links.map((/** @type {any} */ link) => html`
       <tr key=${`${link.protocol} ${link.source} ${link.destination}`}>
@@ -191,6 +192,7 @@ function Links() {
       <td>${link.protocol === 'rtps' ? 'RTPS' : 'Zenoh'}</td>
       <td class="number">${count(link.connections)}</td>
       <td class="number">${duration(link.round_trip_seconds)}</td>
+      <td class="number">${bytes(link.unsent_bytes)}</td>
       <td class="number">${bytes(link.unacknowledged_bytes)}</td>
       <td class="number">${count(link.sent_segments)}</td>
       <td class="number">${count(link.retransmitted_segments)} (${percent(again(link))})</td></tr>`)}
@@ -268,7 +270,7 @@ export function NodeView({ name, query }) {
         <td class="number">${bytes(process?.memory_bytes)}</td>
         <td class="number">${count(process?.threads)}</td>
         <td>${date(process?.started_timestamp_seconds)}</td>
-        <td>${groupOf(own.cgroup) && html`<${Name} text=${groupOf(own.cgroup)} /><br />`}<span
+        <td>${own.container && html`<${Name} text=${own.container} /><br />`}<span
           class="dim"><${Name} text=${own.cgroup ?? ''} /></span></td>
         <td>${own.vendor ?? ''} <${Name} text=${own.guid} /></td></tr>`;
     })}</tbody></table></div></section>

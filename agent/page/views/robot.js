@@ -365,6 +365,31 @@ export function stampAge(edge) {
   return edge.is_static || Math.abs(own) > OTHER_CLOCK_S ? null : own;
 }
 
+/**
+ * Returns by how many seconds a node that asks for the present exceeds the latest transform, about:
+ * the age of its stamp, and the time until the next one. Null for a static edge, for simulated time, and
+ * before a second transform.
+ * @param {any} edge
+ * @param {number} now time of the answer
+ */
+export function extrapolation(edge, now) {
+  const age = stampAge(edge);
+  const interval = edge.longest_interval_seconds;
+  return age == null || interval == null ? null
+    : Math.max(0, age + Math.max(interval, now - edge.timestamp_seconds));
+}
+
+/**
+ * Returns the jumps of an edge in words, by kind. They are unknown in answers of earlier agents.
+ * @param {{translation: number, rotation: number, time: number}|undefined} jumps
+ */
+export function jumpWords(jumps) {
+  if (!jumps) return '–';
+  const kinds = /** @type {[string, number][]} */ ([['position', jumps.translation],
+    ['orientation', jumps.rotation], ['time', jumps.time]]);
+  return kinds.filter(([, number]) => number).map(([kind, number]) => `${count(number)} ${kind}`).join(', ') || '0';
+}
+
 /** Returns frames with those below them. @param {import('../transforms.js').Frame[]} frames @returns {[import('../transforms.js').Frame, number][]} */
 const below = (frames, depth = 0) => frames.flatMap((frame) => [
   /** @type {[import('../transforms.js').Frame, number]} */ ([frame, depth]), ...below(frame.children, depth + 1)]);
@@ -385,21 +410,24 @@ function Transforms() {
       <div class="scroll" tabindex="0" role="group" aria-label=${`Tree of frames ${tree.namespace}`}><table>
       <thead><tr><th scope="col">Frame</th><th scope="col" class="number">Rate</th>
         <th scope="col" class="number">Last</th><th scope="col" class="number">Age of stamp</th>
+        <th scope="col" class="number">Extrapolation</th>
         <th scope="col" class="number">Jumps</th><th scope="col">Broadcaster</th>
         <th scope="col" class="number">x, y, z (m)</th></tr></thead>
       <tbody>${below(roots(tree.edges)).map(([frame, depth]) => html`<${Frame} key=${frame.name} depth=${depth}
-        frame=${frame} tree=${tree} jumps=${jumps} />`)}</tbody></table></div></section>`)}
-      <p class="dim">Age of stamp: how old the latest transform was when it arrived, and thus how far nodes
-        must extrapolate or wait. Jumps: in ${inWords(time).replace(/^The/, 'the')}, as far as events are known.</p>`
+        frame=${frame} tree=${tree} jumps=${jumps} now=${answer.data.timestamp_seconds} />`)}</tbody></table></div></section>`)}
+      <p class="dim">Age of stamp: how old the latest transform was when it arrived. Extrapolation: a node
+        that asks for the present exceeds the latest transform by about this time, and waits or extrapolates.
+        Whether its lookup fails cannot be seen on the network. Jumps: since its broadcasters appeared, by
+        kind; a mark means one in ${inWords(time).replace(/^The/, 'the')}.</p>`
       : html`<${Nothing} answer=${answer} part="transforms">No message of <code>/tf</code> so far. A
         message that no subscription requests is not sent.</${Nothing}>`}`;
 }
 
 /**
  * A frame with its edge to its parent.
- * @param {{frame: import('../transforms.js').Frame, depth: number, tree: any, jumps: Map<string, number>}} props
+ * @param {{frame: import('../transforms.js').Frame, depth: number, tree: any, jumps: Map<string, number>, now: number}} props
  */
-function Frame({ frame, depth, tree, jumps }) {
+function Frame({ frame, depth, tree, jumps, now }) {
   const { edge, name } = frame;
   const nodes = (edge?.broadcasters ?? []).map((/** @type {any} */ each) => each.ros_node ?? each.writer);
   const jumped = jumps.get(`${tree.domain_id} ${tree.namespace} ${name}`) ?? 0;
@@ -411,10 +439,11 @@ function Frame({ frame, depth, tree, jumps }) {
         Math.max(0, state.time - edge.timestamp_seconds))} ago`}</td>
       <td class="number">${old != null && old < 0 ? html`<${Mark} severity="warning" /> ${duration(-old)} ahead`
         : duration(old)}</td>
-      <td class="number">${jumped > 0 && html`<${Mark} severity="warning" /> `}${count(jumped)}</td>
+      <td class="number">${duration(extrapolation(edge, now))}</td>
+      <td class="number">${jumped > 0 && html`<${Mark} severity="warning" /> `}${jumpWords(edge.jumps)}</td>
       <td><${Name} text=${nodes.join(', ')} /></td>
       <td class="number">(${edge.translation.map((/** @type {number} */ each) => each.toFixed(2)).join(', ')})</td>`
-      : html`<td colspan="6"></td>`}</tr>`;
+      : html`<td colspan="7"></td>`}</tr>`;
 }
 
 /** @param {Props} props */

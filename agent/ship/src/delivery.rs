@@ -368,8 +368,8 @@ impl Shipper {
 
     fn destination(&self) -> Destination {
         Destination {
-            url: self.settings.url.clone(),
-            endpoint: self.settings.endpoint.clone(),
+            url: self.settings.store.url.clone(),
+            endpoint: self.settings.store.endpoint.clone(),
             instance: self.settings.instance.clone(),
         }
     }

@@ -7,6 +7,7 @@
 //! - [`Settings`] select destination, bandwidth and times.
 //! - [`Shipper`] delivers bags, and deletes delivered ones if space is needed.
 //! - [`is_delivered`] returns whether the destination has a bag, for programs that delete bags.
+//! - [`Archive`] lists the bags of all robots at a destination.
 //! - [`Status`] is what `rp ship --status` prints.
 //!
 //! The crate neither records nor repairs bags. An unfinished bag is delivered as it is, and its
@@ -14,6 +15,7 @@
 
 #![forbid(unsafe_code)]
 
+mod archive;
 mod bags;
 mod credentials;
 mod delivery;
@@ -28,8 +30,9 @@ mod status;
 mod store;
 mod windows;
 
+pub use archive::{Archive, ArchiveError, Listing, StoredBag};
 pub use manifest::{Manifest, ManifestFile};
-pub use settings::{Settings, SettingsError, SpaceLimits, is_destination};
+pub use settings::{Settings, SettingsError, SpaceLimits, StoreSettings, is_destination};
 pub use shipper::{Findings, Observer, ShipError, Shipper};
 pub use state::{RECORDS_DIRECTORY, is_delivered};
 pub use status::{Delivered, Failure, Status, StatusError, Uploading};

@@ -96,10 +96,12 @@ mod tests {
         let link = Link::new(Some(100_000));
         let begun = Instant::now();
         let turns: Vec<_> = (0..11).map(|_| link.reserve(10_000)).collect();
-        assert!(turns[0] < begun + Duration::from_millis(50));
+        // A busy machine may take some time for the reservations themselves.
+        let took = begun.elapsed();
+        assert!(turns[0] < begun + took + Duration::from_millis(50));
         let whole = turns[10] - turns[0];
         assert!(whole >= Duration::from_millis(950), "{whole:?}");
-        assert!(whole <= Duration::from_millis(1_050), "{whole:?}");
+        assert!(whole <= Duration::from_millis(1_050) + took, "{whole:?}");
         let unlimited = Link::new(None);
         unlimited.reserve(1 << 30);
         assert!(unlimited.reserve(1) < Instant::now() + Duration::from_millis(50));

@@ -4,6 +4,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use object_store::ObjectStoreScheme;
+use object_store::path::Path as StorePath;
 use url::Url;
 
 use crate::windows::Windows;
@@ -11,21 +12,10 @@ use crate::windows::Windows;
 /// Settings of a delivery.
 #[derive(Clone, Debug)]
 pub struct Settings {
-    /// Destination: `s3://BUCKET/PREFIX`, `gs://BUCKET/PREFIX`, `az://CONTAINER/PREFIX`, or
-    /// `file:///DIRECTORY`.
-    pub url: String,
-    /// Address of a store other than that of the provider.
-    pub endpoint: Option<String>,
-    /// Region of the bucket.
-    pub region: Option<String>,
+    /// The destination.
+    pub store: StoreSettings,
     /// Name of this robot.
     pub instance: String,
-    /// File with credentials: lines `NAME=value`.
-    pub credentials_file: Option<PathBuf>,
-    /// File with the certificate authorities that may sign the store's certificate.
-    pub ca_file: Option<PathBuf>,
-    /// Maximum number of bytes of requests per second.
-    pub max_bytes_per_second: Option<u64>,
     /// Times of the day in which bags are delivered.
     pub windows: Windows,
     /// Whether triggered snapshots are delivered outside the windows too.
@@ -36,6 +26,24 @@ pub struct Settings {
     pub state: PathBuf,
     /// Limits of the space for bags.
     pub space: SpaceLimits,
+}
+
+/// A destination of bags.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct StoreSettings {
+    /// `s3://BUCKET/PREFIX`, `gs://BUCKET/PREFIX`, `az://CONTAINER/PREFIX`, or
+    /// `file:///DIRECTORY`.
+    pub url: String,
+    /// Address of a store other than that of the provider.
+    pub endpoint: Option<String>,
+    /// Region of the bucket.
+    pub region: Option<String>,
+    /// File with credentials: lines `NAME=value`.
+    pub credentials_file: Option<PathBuf>,
+    /// File with the certificate authorities that may sign the store's certificate.
+    pub ca_file: Option<PathBuf>,
+    /// Maximum number of bytes of requests per second.
+    pub max_bytes_per_second: Option<u64>,
 }
 
 /// Limits of the agent for the space of bags.
@@ -53,10 +61,10 @@ pub struct SpaceLimits {
 #[derive(Debug, thiserror::Error)]
 pub enum SettingsError {
     /// The URL names no destination.
-    #[error("ship.url: `{0}` is no destination, as in `s3://bucket/prefix` or `file:///mnt/bags`")]
+    #[error("`{0}` is no destination, as in `s3://bucket/prefix` or `file:///mnt/bags`")]
     Url(String),
     /// A file cannot be read.
-    #[error("ship.{key}: cannot read {}", path.display())]
+    #[error("cannot read {} (`{key}`)", path.display())]
     File {
         /// Key of the configuration.
         key: &'static str,
@@ -66,7 +74,7 @@ pub enum SettingsError {
         source: io::Error,
     },
     /// A line of the credentials file is not `NAME=value` with a name of this store.
-    #[error("ship.credentials_file: line {line} of {} is not NAME=value with a name of this store", path.display())]
+    #[error("line {line} of {} is not NAME=value with a name of this store", path.display())]
     Credentials {
         /// Path of the file.
         path: PathBuf,
@@ -74,13 +82,13 @@ pub enum SettingsError {
         line: usize,
     },
     /// A file has no certificates.
-    #[error("ship.ca_file: {} has no certificates in PEM", .0.display())]
+    #[error("{} has no certificates in PEM (`ca_file`)", .0.display())]
     Authorities(PathBuf),
     /// The certificate authorities of the system cannot be read.
-    #[error("the certificate authorities of this system cannot be read (ship.ca_file)")]
+    #[error("the certificate authorities of this system cannot be read: name others in `ca_file`")]
     SystemAuthorities(#[source] io::Error),
     /// The folder does not exist.
-    #[error("ship.url: the folder {} does not exist", .0.display())]
+    #[error("the folder {} does not exist", .0.display())]
     Folder(PathBuf),
     /// The settings of the store are incomplete or contradict each other.
     #[error("the store cannot be used")]
@@ -91,6 +99,18 @@ pub enum SettingsError {
 #[must_use]
 pub fn is_destination(text: &str) -> bool {
     destination(text).is_some()
+}
+
+impl StoreSettings {
+    /// Returns the path of the robots' directories, in the bucket or in the folder.
+    pub(crate) fn prefix(&self) -> Result<StorePath, SettingsError> {
+        let wrong = || SettingsError::Url(self.url.clone());
+        let (_, url) = destination(&self.url).ok_or_else(wrong)?;
+        match url.scheme() {
+            "file" => Ok(StorePath::ROOT),
+            _ => StorePath::from_url_path(url.path()).map_err(|_| wrong()),
+        }
+    }
 }
 
 /// Returns the kind of a destination and its URL.

@@ -14,7 +14,7 @@ use tokio::time::sleep;
 
 use crate::bags::{Bag, Fingerprint, Found, Scanner};
 use crate::delivery::{DeliveryError, PartialChecksum, Step};
-use crate::settings::{Settings, SettingsError, destination};
+use crate::settings::{Settings, SettingsError};
 use crate::space;
 use crate::state::{Delivery, Records, RecordsError};
 use crate::status::{Delivered, Failure, MAX_LISTED, Status, Uploading, now};
@@ -109,12 +109,7 @@ impl Shipper {
         findings: Option<Findings>,
         observer: Option<Observer>,
     ) -> Result<Self, ShipError> {
-        let wrong = || SettingsError::Url(settings.url.clone());
-        let (_, url) = destination(&settings.url).ok_or_else(wrong)?;
-        let prefix = match url.scheme() {
-            "file" => Path::ROOT,
-            _ => Path::from_url_path(url.path()).map_err(|_| wrong())?,
-        };
+        let prefix = settings.store.prefix()?;
         let records = Records::open(&settings.state)?;
         let mut status = Status::read(&settings.state).unwrap_or_default();
         status.uploading = None;
@@ -214,7 +209,7 @@ impl Shipper {
     pub(crate) fn store(&mut self) -> Result<&mut Store, SettingsError> {
         match &mut self.store {
             Some(store) => Ok(store),
-            none => Ok(none.insert(Store::open(&self.settings)?)),
+            none => Ok(none.insert(Store::open(&self.settings.store)?)),
         }
     }
 
@@ -544,7 +539,7 @@ mod tests {
 
     use super::*;
     use crate::manifest::Manifest;
-    use crate::settings::SpaceLimits;
+    use crate::settings::{SpaceLimits, StoreSettings};
     use crate::windows::Windows;
 
     /// Writes a bag that ended some time ago.
@@ -567,13 +562,11 @@ mod tests {
             fs::create_dir(path(name)).unwrap();
         }
         let settings = Settings {
-            url: format!("file://{}", path("folder").display()),
-            endpoint: None,
-            region: None,
+            store: StoreSettings {
+                url: format!("file://{}", path("folder").display()),
+                ..StoreSettings::default()
+            },
             instance: "robot".to_owned(),
-            credentials_file: None,
-            ca_file: None,
-            max_bytes_per_second: None,
             windows: Windows::default(),
             triggered_always: false,
             recordings: path("bags"),

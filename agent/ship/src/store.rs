@@ -11,23 +11,27 @@ use bytes::Bytes;
 use object_store::aws::AmazonS3Builder;
 use object_store::azure::MicrosoftAzureBuilder;
 use object_store::gcp::GoogleCloudStorageBuilder;
+use object_store::list::{PaginatedListOptions, PaginatedListResult, PaginatedListStore};
 use object_store::local::LocalFileSystem;
 use object_store::multipart::{MultipartStore, PartId};
 use object_store::path::Path;
 use object_store::{
-    Error, MultipartUpload as _, ObjectStore, ObjectStoreExt as _, ObjectStoreScheme, PutPayload,
-    RetryConfig,
+    Error, MultipartUpload as _, ObjectMeta, ObjectStore, ObjectStoreExt as _, ObjectStoreScheme,
+    PutPayload, RetryConfig,
 };
 use tokio::time::sleep_until;
 
 use crate::credentials::{Credentials, Entry};
 use crate::http::Connections;
 use crate::link::{Link, PIECE_BYTES};
-use crate::settings::{Settings, SettingsError, destination};
+use crate::settings::{SettingsError, StoreSettings, destination};
+
+/// Number of objects in one page of a listing: the most that S3 returns.
+const PAGE_OBJECTS: usize = 1_000;
 
 /// The destination with its current credentials.
 pub(crate) struct Store {
-    settings: Settings,
+    settings: StoreSettings,
     link: Arc<Link>,
     credentials: Credentials,
     client: Client,
@@ -39,14 +43,15 @@ enum Client {
 }
 
 /// The folder of a destination.
-struct Folder {
-    path: PathBuf,
+#[derive(Clone)]
+pub(crate) struct Folder {
+    pub(crate) path: PathBuf,
     /// Directory above it, or itself, at which another file system was mounted.
     mount_point: Option<PathBuf>,
 }
 
 impl Folder {
-    fn open(path: PathBuf) -> Result<Self, SettingsError> {
+    pub(crate) fn open(path: PathBuf) -> Result<Self, SettingsError> {
         if !path.is_dir() {
             return Err(SettingsError::Folder(path));
         }
@@ -61,7 +66,7 @@ impl Folder {
 
     /// Fails if the folder is gone. Files would otherwise create it again: on the robot's own disk,
     /// if a disk was removed.
-    fn check(&self) -> Result<(), StoreError> {
+    pub(crate) fn check(&self) -> Result<(), StoreError> {
         let is_mounted = self.mount_point.as_deref().is_none_or(is_mount_point);
         if self.path.is_dir() && is_mounted {
             return Ok(());
@@ -78,10 +83,11 @@ fn is_mount_point(path: &std::path::Path) -> bool {
         .is_some_and(|above| device(path) != device(above))
 }
 
-/// A store whose parts can be sent by one process and completed by another.
-trait Parts: ObjectStore + MultipartStore {}
+/// A store whose parts can be sent by one process and completed by another, and whose objects are
+/// listed in pages.
+trait Parts: ObjectStore + MultipartStore + PaginatedListStore {}
 
-impl<S: ObjectStore + MultipartStore> Parts for S {}
+impl<S: ObjectStore + MultipartStore + PaginatedListStore> Parts for S {}
 
 /// A request failed. The texts name neither addresses nor credentials.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -118,7 +124,7 @@ impl StoreError {
 
 impl Store {
     /// Opens the destination without a request.
-    pub(crate) fn open(settings: &Settings) -> Result<Self, SettingsError> {
+    pub(crate) fn open(settings: &StoreSettings) -> Result<Self, SettingsError> {
         let link = Arc::new(Link::new(settings.max_bytes_per_second));
         let credentials = read(settings)?;
         Ok(Self {
@@ -170,6 +176,23 @@ impl Store {
             Err(error) => Err(error),
         };
         got.map(Some).map_err(|error| self.failed(&error))
+    }
+
+    /// Returns a page of the objects whose names begin with a text, and the token of the next page.
+    /// A folder has no pages.
+    pub(crate) async fn page(
+        &self,
+        begin: &str,
+        token: Option<String>,
+    ) -> Result<(Vec<ObjectMeta>, Option<String>), StoreError> {
+        let options = PaginatedListOptions {
+            max_keys: Some(PAGE_OBJECTS),
+            page_token: token,
+            ..PaginatedListOptions::default()
+        };
+        let page = self.parts()?.list_paginated(Some(begin), options).await;
+        let PaginatedListResult { result, page_token } = page.map_err(|it| self.failed(&it))?;
+        Ok((result.objects, page_token))
     }
 
     /// Returns the size of an object in bytes; `None` if it does not exist.
@@ -358,14 +381,14 @@ fn code(answer: &str) -> String {
     }
 }
 
-fn read(settings: &Settings) -> Result<Credentials, SettingsError> {
+fn read(settings: &StoreSettings) -> Result<Credentials, SettingsError> {
     let file = settings.credentials_file.as_deref();
     file.map_or_else(|| Ok(Credentials::default()), Credentials::read)
 }
 
 /// Creates a client from the environment, then the configuration, then the file with credentials.
 fn client(
-    settings: &Settings,
+    settings: &StoreSettings,
     credentials: &Credentials,
     link: &Arc<Link>,
 ) -> Result<Client, SettingsError> {

@@ -10,7 +10,7 @@ use crate::repository;
 use serde_json::Value;
 
 /// Maximum wait for a log line, a response, a metric or the end.
-pub const PATIENCE: Duration = Duration::from_secs(30);
+pub const PATIENCE: Duration = Duration::from_secs(90);
 
 /// Returns a small capture of the repository.
 pub fn capture() -> PathBuf {

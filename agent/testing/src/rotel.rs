@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use crate::{ports::free_address, repository};
 
 /// Maximum wait for output.
-const PATIENCE: Duration = Duration::from_secs(30);
+const PATIENCE: Duration = Duration::from_secs(90);
 
 /// A running receiver. Dropping the value kills it and keeps its output.
 pub struct Rotel {

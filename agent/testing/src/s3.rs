@@ -21,6 +21,8 @@ use tokio::runtime::Runtime;
 const PATIENCE: Duration = Duration::from_secs(60);
 /// Name of the bucket.
 pub const BUCKET: &str = "bags";
+/// Maximum number of objects in a page of a listing; a store may return fewer than requested.
+const PAGE_OBJECTS: usize = 2;
 /// Minimum size of a part, except the last one.
 const PART_BYTES: usize = 5 << 20;
 
@@ -42,6 +44,8 @@ pub struct Call {
 pub enum Operation {
     Get,
     Head,
+    /// A page of the objects below a prefix, which is the object of the call.
+    List,
     Put,
     Begin,
     /// A part, numbered from 1.
@@ -78,6 +82,8 @@ struct State {
     /// Keys that it accepts; empty = every key.
     keys: BTreeSet<String>,
     objects: BTreeMap<String, Bytes>,
+    /// Seconds at which they were written, each one later than the one before.
+    written: BTreeMap<String, u64>,
     uploads: BTreeMap<String, (String, BTreeMap<usize, Bytes>)>,
     /// Requests that were served, in their order.
     served: Vec<Call>,
@@ -144,8 +150,7 @@ impl Store {
 
     /// Adds an object.
     pub fn insert(&self, object: &str, content: Vec<u8>) {
-        let mut state = self.state();
-        state.objects.insert(object.to_owned(), content.into());
+        self.state().write(object.to_owned(), content.into());
     }
 
     /// Removes an object.
@@ -206,8 +211,12 @@ async fn answer(
         .map(|pair| pair.split_once('=').unwrap_or((pair, "")))
         .map(|(name, value)| (name.to_owned(), value.to_owned()))
         .collect();
-    let object = head.uri.path().strip_prefix(&format!("/{BUCKET}/"));
-    let object = object.unwrap_or_else(|| panic!("{}", head.uri)).to_owned();
+    let object = head.uri.path().strip_prefix(&format!("/{BUCKET}"));
+    let object = object.unwrap_or_else(|| panic!("{}", head.uri));
+    let object = match query.get("prefix") {
+        Some(prefix) => prefix.replace("%2F", "/"),
+        None => object.trim_start_matches('/').to_owned(),
+    };
     let length = header(&head.headers, "content-length").parse().unwrap_or(0);
     let authorization = header(&head.headers, "authorization");
     let key = authorization
@@ -250,7 +259,11 @@ async fn answer(
     }
     let upload = query.get("uploadId").map_or("", String::as_str);
     let mut state = state.lock().unwrap();
-    let response = state.serve(&call, upload, content.into());
+    let token = query.get("continuation-token");
+    let response = match call.operation {
+        Operation::List => state.list(&call.object, token.map_or("", String::as_str)),
+        _ => state.serve(&call, upload, content.into()),
+    };
     state.served.push(call);
     match fate {
         RequestOutcome::CutAnswer => Err(Cut),
@@ -259,6 +272,39 @@ async fn answer(
 }
 
 impl State {
+    fn write(&mut self, object: String, content: Bytes) {
+        let last = self.written.values().max().copied().unwrap_or_default();
+        self.written.insert(object.clone(), last + 1);
+        self.objects.insert(object, content);
+    }
+
+    /// Returns the page that begins after `token`, which a client has as it was sent.
+    fn list(&self, prefix: &str, token: &str) -> Response<Full<Bytes>> {
+        let token = token.replace("%2F", "/");
+        let is_listed = |(name, _): &(&String, &Bytes)| {
+            name.starts_with(prefix) && name.as_str() > token.as_str()
+        };
+        let mut left = self.objects.iter().filter(is_listed);
+        let mut text = "<ListBucketResult>".to_owned();
+        let mut last = None;
+        for (name, content) in left.by_ref().take(PAGE_OBJECTS) {
+            let seconds = self.written[name];
+            text += &format!(
+                "<Contents><Key>{name}</Key><Size>{}</Size>\
+                 <LastModified>2026-11-01T{:02}:{:02}:{:02}.000Z</LastModified></Contents>",
+                content.len(),
+                seconds / 3600,
+                seconds / 60 % 60,
+                seconds % 60,
+            );
+            last = Some(name);
+        }
+        if let (Some(last), Some(_)) = (last, left.next()) {
+            text += &format!("<NextContinuationToken>{last}</NextContinuationToken>");
+        }
+        xml(&(text + "</ListBucketResult>"))
+    }
+
     fn serve(&mut self, call: &Call, upload: &str, content: Bytes) -> Response<Full<Bytes>> {
         let object = call.object.clone();
         let is_of = |found: &(String, BTreeMap<usize, Bytes>)| found.0 == object;
@@ -277,9 +323,10 @@ impl State {
                     response.body(Full::new(body)).unwrap()
                 }
             },
+            Operation::List => unreachable!("it has no object"),
             Operation::Put => {
                 let etag = etag(&content);
-                self.objects.insert(object, content);
+                self.write(object, content);
                 with_etag(&etag)
             }
             Operation::Begin => {
@@ -326,7 +373,7 @@ impl State {
                 }
                 let whole: Vec<u8> = parts.values().flat_map(|part| part.to_vec()).collect();
                 self.uploads.remove(upload);
-                self.objects.insert(object, whole.into());
+                self.write(object, whole.into());
                 xml("<CompleteMultipartUploadResult><ETag>\"whole\"</ETag>\
                      </CompleteMultipartUploadResult>")
             }
@@ -344,6 +391,7 @@ impl State {
 fn operation(method: &Method, query: &BTreeMap<String, String>) -> Operation {
     let (is_upload, part) = (query.contains_key("uploadId"), query.get("partNumber"));
     match (method.as_str(), is_upload, part) {
+        ("GET", false, None) if query.contains_key("list-type") => Operation::List,
         ("GET", false, None) => Operation::Get,
         ("HEAD", false, None) => Operation::Head,
         ("PUT", false, None) => Operation::Put,

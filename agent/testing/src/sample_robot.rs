@@ -146,6 +146,7 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
             addresses: Addresses {
                 metatraffic: Box::default(),
                 default: Box::new([([10, 0, 0, 2], 7411).into()]),
+                tcp: Box::default(),
             },
         }],
         sockets: vec![SocketFacts {
@@ -197,6 +198,7 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
             unseen: [1, 0, 0, 0, 0, 0],
         }),
         chains: chains(),
+        tls_connections: 2,
         links: vec![LinkFacts {
             key: LinkKey {
                 protocol: LinkProtocol::Zenoh,
@@ -208,6 +210,7 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
             retransmitted: 40,
             round_trip: Some(Duration::from_micros(2500)),
             unacknowledged: 1448,
+            unsent: Some(20_000),
         }],
         diagnosed: Arc::new(vec![ModelTime::from_nanoseconds(5); diagnoses().list.len()]),
         diagnoses: Arc::new(diagnoses()),
@@ -345,10 +348,6 @@ fn diagnoses() -> Diagnoses {
             reader: Some(reader),
             backends: vec!["cuda".into()],
         },
-        Diagnosis::SharedMachineId {
-            domain_id: DomainId(0),
-            participants: vec![participant, writer],
-        },
         Diagnosis::LossyLink {
             link: LinkKey {
                 protocol: LinkProtocol::Zenoh,
@@ -356,6 +355,7 @@ fn diagnoses() -> Diagnoses {
                 destination: [10, 0, 0, 2].into(),
             },
             retransmitted_permille: 40,
+            unsent: Some(20_000),
         },
         Diagnosis::LogErrors {
             domain_id: DomainId(0),

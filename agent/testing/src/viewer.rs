@@ -15,7 +15,7 @@ use tokio_tungstenite::tungstenite::{self, HandshakeError, Message, WebSocket};
 /// Names of the subprotocol.
 pub const SUBPROTOCOLS: [&str; 2] = ["foxglove.websocket.v1", "foxglove.sdk.v1"];
 /// Maximum wait for an expected message.
-pub const PATIENCE: Duration = Duration::from_secs(20);
+pub const PATIENCE: Duration = Duration::from_secs(60);
 
 /// `serverInfo`.
 #[derive(Clone, Debug, Deserialize)]

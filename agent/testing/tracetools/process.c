@@ -36,6 +36,8 @@ void ros_trace_callback_end(const void *);
 void ros_trace_rcl_lifecycle_state_machine_init(const void *, const void *);
 void ros_trace_rcl_lifecycle_transition(const void *, const char *, const char *);
 void ros_trace_rcl_publish(const void *, const void *);
+void ros_trace_rcl_service_init(const void *, const void *, const void *, const char *);
+void ros_trace_rclcpp_service_callback_added(const void *, const void *);
 void ros_trace_rmw_take(const void *, const void *, int64_t, bool);
 void ros_trace_rclcpp_executor_get_next_ready(void);
 void ros_trace_rclcpp_executor_execute(const void *);
@@ -88,7 +90,7 @@ static struct handle unnamed = { &unnamed_impl };
 static struct timer_impl timer_impl;
 static struct timer timer = { &timer_impl };
 static char node, object, machine, owner;
-static char callback[8], buffer[8], timer_callback, message;
+static char callback[8], buffer[8], timer_callback, service, service_callback, message;
 static uint64_t capacity = 4, filled, writes, reads;
 
 /* A thread that holds the lock for `us` microseconds of each period, and rests for as long. */
@@ -280,6 +282,8 @@ int main(int argc, char **argv) {
             ros_trace_rclcpp_timer_callback_added(&timer, &timer_callback);
             ros_trace_rclcpp_timer_link_node(&timer, &node);
             ros_trace_rcl_lifecycle_state_machine_init(&node, &machine);
+            ros_trace_rcl_service_init(&service, &node, 0, "/robot1/reset");
+            ros_trace_rclcpp_service_callback_added(&service, &service_callback);
         } else if (!strcmp(what, "transition")) {
             ros_trace_rcl_lifecycle_transition(&machine, "inactive", "active");
         } else if (!strcmp(what, "publish")) {
@@ -345,6 +349,17 @@ int main(int argc, char **argv) {
                 ros_trace_callback_start(callback, false);
                 pass(us);
                 ros_trace_callback_end(callback);
+            }
+        } else if (!strcmp(what, "serve")) {
+            /* Finds no message, and answers requests in callbacks of `us` microseconds. */
+            for (long i = 0; i < n; i++) {
+                ros_trace_rclcpp_executor_get_next_ready();
+                ros_trace_rclcpp_executor_execute(&in);
+                ros_trace_rmw_take(&in_rmw, &message, 0, false);
+                ros_trace_rclcpp_executor_get_next_ready();
+                ros_trace_callback_start(&service_callback, false);
+                pass(us);
+                ros_trace_callback_end(&service_callback);
             }
         } else if (!strcmp(what, "relay")) {
             /* Takes a message with the source timestamp `n`. The callback publishes after `us`

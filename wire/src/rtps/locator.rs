@@ -68,6 +68,26 @@ impl Locator {
         Some(SocketAddr::new(address, u16::try_from(self.port).ok()?))
     }
 
+    /// Returns the addresses at which the participant accepts TCP connections: its own, and the one
+    /// outside of its network if it announces one. They are empty for other transports, and if the
+    /// participant only opens connections. In the port, the upper half is the logical port.
+    pub fn tcp(&self) -> impl Iterator<Item = SocketAddr> {
+        let port = (self.port & 0xffff) as u16;
+        let [.., e, f, g, h, a, b, c, d] = self.address;
+        let wan = Ipv4Addr::new(e, f, g, h);
+        let addresses = match self.kind {
+            LocatorKind::TCP_V4 => [
+                Some(IpAddr::V4(Ipv4Addr::new(a, b, c, d))),
+                (!wan.is_unspecified()).then_some(IpAddr::V4(wan)),
+            ],
+            LocatorKind::TCP_V6 => [Some(IpAddr::V6(Ipv6Addr::from(self.address))), None],
+            _ => [None, None],
+        };
+        let addresses = addresses.into_iter().flatten();
+        let addresses = addresses.map(move |address| SocketAddr::new(address, port));
+        addresses.filter(|address| address.port() != 0)
+    }
+
     /// Returns whether the transport is TCP (Fast DDS).
     #[must_use]
     pub const fn is_tcp(&self) -> bool {

@@ -12,7 +12,7 @@ use std::time::Duration;
 use ros2probe_model::facts::bounded::Bounded;
 use ros2probe_model::facts::calls::late::{
     Activity, Blocked, BusyTime, CpuLimit, Handoff, LateBound, LateCall, MessageDelivery,
-    PreviousCall, Stop, WaitingStates,
+    PreviousCall, Repairs, Stop, WaitingStates,
 };
 use ros2probe_model::facts::calls::other_thread::{OtherThread, Priority};
 use ros2probe_model::facts::calls::report::{ThreadStates, Trigger};
@@ -510,6 +510,7 @@ pub(super) fn convert(
         cpu: call.cpu,
         delivery,
         handoff: (has_events && is_message && call.handoff.at != 0).then(|| handoff(call, unit_of)),
+        repairs: Repairs::default(),
         cpu_limits: Arc::clone(cpu_limits),
         stop: (call.stop_ended != 0 && call.stop_ended <= call.started).then(|| Stop {
             ended_before: between(call.stop_ended, call.started),

@@ -25,6 +25,7 @@ use std::time::{Duration, Instant};
 
 use ros2probe_attach::client::Broker;
 use ros2probe_model::facts::bounded::Bounded;
+use ros2probe_wire::Timestamp;
 
 use self::late::{LateDemand, LateObservation};
 use self::observation::Probes;
@@ -182,12 +183,17 @@ impl Inside {
         spawn(Task::Inside, thread, work).map(drop)
     }
 
-    /// Takes the rounds since the last call, oldest first.
+    /// Takes the rounds that have not been taken, up to the time `until`, oldest first.
     #[must_use]
-    pub fn take(&self) -> Vec<Round> {
+    pub fn take(&self, until: Timestamp) -> Vec<Round> {
         let rounds = self.shared.rounds.lock();
         let mut rounds = rounds.unwrap_or_else(PoisonError::into_inner);
-        rounds.take()
+        let mut due = rounds.take();
+        let number = due.iter().take_while(|round| round.report.at <= until);
+        for later in due.split_off(number.count()) {
+            rounds.push(later);
+        }
+        due
     }
 
     /// Sets whether a client needs calls. The setting matters only if calls are observed on demand.

@@ -247,6 +247,11 @@ impl Names {
         topic_of: impl Fn(u64) -> Option<Endpoint>,
     ) -> (Trigger, Option<NodeName>) {
         let created = self.known.get(&(ObjectKind::Callback, callback));
+        if let Some(ObjectFact::Relation(ObjectKind::Service, service)) = created {
+            let service = self.endpoint(ObjectKind::Service, *service);
+            let name = service.as_ref().map(|of| Arc::clone(&of.name));
+            return (Trigger::Service(name), service.and_then(|of| of.node));
+        }
         let trigger = figures.trigger;
         match trigger.kind {
             kind::SUBSCRIPTION => match self.subscription(trigger.address) {
@@ -278,14 +283,7 @@ impl Names {
                 };
                 (Trigger::Timer(read.or(announced)), node)
             }
-            _ => match created {
-                Some(ObjectFact::Relation(ObjectKind::Service, service)) => {
-                    let service = self.endpoint(ObjectKind::Service, *service);
-                    let name = service.as_ref().map(|of| Arc::clone(&of.name));
-                    (Trigger::Service(name), service.and_then(|of| of.node))
-                }
-                _ => (Trigger::Service(None), None),
-            },
+            _ => (Trigger::Service(None), None),
         }
     }
 }

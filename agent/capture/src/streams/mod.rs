@@ -101,6 +101,8 @@ pub enum Streamed<'a> {
     },
     /// Bytes of a connection of RTPS to this destination are missing before this time.
     Gap(Destination, Timestamp),
+    /// A client begins a handshake of TLS on a port that is not of Zenoh.
+    ClientHello(Flow),
 }
 
 impl Streamed<'_> {
@@ -108,6 +110,7 @@ impl Streamed<'_> {
     pub fn pass_to(&self, observer: &mut Observer) {
         match *self {
             Self::Zenoh(report) => observer.input(Input::Zenoh(report)),
+            Self::ClientHello(flow) => observer.input(Input::ClientHello(flow)),
             Self::Gap(destination, time) => observer.input(Input::StreamGap(destination, time)),
             Self::Message {
                 envelope,
@@ -251,6 +254,9 @@ impl Streams {
         }
         if took == TakeResult::Tls {
             pass(Event::Zenoh(StreamEvent::Unseen(Unseen::Tls)));
+        }
+        if took == TakeResult::ClientHello {
+            report(&Streamed::ClientHello(id.flow));
         }
         if chunk.end {
             self.forget(&id);

@@ -21,6 +21,8 @@ pub enum Assessment {
     Undecided,
     /// A TLS handshake on a port of Zenoh.
     Tls,
+    /// A client's TLS handshake on another port.
+    ClientHello,
     /// Something else.
     Other,
 }
@@ -99,6 +101,7 @@ impl Search {
         match Beginning::of(*head, u32::MAX, is_port) {
             Beginning::Init | Beginning::OtherVersion => Assessment::Zenoh(self.held.take()),
             Beginning::Tls => Assessment::Tls,
+            Beginning::ClientHello => Assessment::ClientHello,
             _ => Assessment::Other,
         }
     }

@@ -37,6 +37,8 @@ pub enum TakeResult {
     Other,
     /// The connection begins as TLS on a port of Zenoh.
     Tls,
+    /// The connection begins as TLS on another port.
+    ClientHello,
 }
 
 /// What the bytes of a direction contain.
@@ -384,6 +386,10 @@ impl Stream {
                         self.position = Position::Other;
                         self.protocol = Some(Protocol::Zenoh);
                         return TakeResult::Tls;
+                    }
+                    Assessment::ClientHello => {
+                        self.position = Position::Other;
+                        return TakeResult::ClientHello;
                     }
                     Assessment::Other => {
                         self.position = Position::Other;

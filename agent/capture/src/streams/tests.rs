@@ -19,12 +19,15 @@ struct Reported {
     begun: u64,
     ended: u64,
     tls: u64,
+    hellos: u64,
 }
 
 impl Reported {
     fn note(&mut self, streamed: &Streamed<'_>) {
-        let Streamed::Zenoh(report) = streamed else {
-            panic!("{streamed:?}");
+        let report = match streamed {
+            Streamed::Zenoh(report) => report,
+            Streamed::ClientHello(_) => return self.hellos += 1,
+            _ => panic!("{streamed:?}"),
         };
         match report.event {
             StreamEvent::Batch { bytes, length } => {
@@ -210,6 +213,7 @@ fn connections_of_other_protocols_are_ignored_and_tls_is_reported() {
         segment(80, 90_000, &[]),
     ]);
     assert_eq!((reported.tls, reported.ended), (1, 1));
+    assert_eq!(reported.hellos, 1, "on another port");
     assert!(reported.batches.is_empty());
 }
 

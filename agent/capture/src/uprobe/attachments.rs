@@ -408,7 +408,7 @@ mod tests {
 
     #[test]
     fn libraries_that_are_slow_to_refuse_delay_the_caller_for_seconds_only() {
-        let (mut attachments, attempts) = refused(FAILURE_TIME * 2 / 3);
+        let (mut attachments, attempts) = refused(FAILURE_TIME * 11 / 20);
         let (processes, broker) = (processes(4), &mut Broker::here());
         attachments.follow(&processes, Instant::now(), broker);
         assert_eq!(attempts.load(Ordering::Relaxed), 2);

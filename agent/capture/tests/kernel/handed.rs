@@ -23,7 +23,7 @@ use ros2probe_wire::record::{Record, Verdict, flag};
 use ros2probe_wire::walk::{self, Envelope};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 
-const PATIENCE: Duration = Duration::from_secs(10);
+const PATIENCE: Duration = Duration::from_secs(60);
 const EXACT: u16 = flag::SHM | flag::EXACT;
 
 /// A process that passes messages, a filter that observes it, and the participant that it imitates.

@@ -73,6 +73,19 @@ impl Observed {
         }
     }
 
+    /// Returns the records of a writer once this number of reports on lost datagrams has arrived,
+    /// with those that arrive shortly after.
+    fn records_of_lost(&mut self, writer: Guid, number: usize) -> Vec<Record> {
+        let begun = Instant::now();
+        let mut found = Vec::new();
+        let is_lost = |record: &&Record| record.flags & flag::NOT_REASSEMBLED != 0;
+        while found.iter().filter(is_lost).count() < number && begun.elapsed() < PATIENCE {
+            found.extend(self.records(writer, Duration::from_millis(50)));
+        }
+        found.extend(self.records(writer, SETTLED));
+        found
+    }
+
     fn counted(&self, counter: Counter) -> u64 {
         let counters = self.filter.counters().unwrap();
         counters
@@ -235,6 +248,8 @@ fn fragment_numbers<'a>(records: impl IntoIterator<Item = &'a Record>) -> Fragme
         .collect()
 }
 
+/// Maximum wait for the reports on lost datagrams.
+const PATIENCE: Duration = Duration::from_secs(20);
 /// Time until everything sent has arrived.
 const SETTLED: Duration = Duration::from_millis(200);
 
@@ -274,7 +289,7 @@ fn wait_for_link(link: &Link, from: &str, to: &str) {
     let (sender, receiver) = (bind(&link.robot, from), bind(&link.monitor, to));
     let interval = Duration::from_millis(100);
     receiver.set_read_timeout(Some(interval)).unwrap();
-    let is_received = (0..100).any(|_| {
+    let is_received = (0..600).any(|_| {
         // Fails while the link has no carrier.
         let _ = sender.send_to(&[0], receiver.local_addr().unwrap());
         receiver.recv(&mut [0]).is_ok()

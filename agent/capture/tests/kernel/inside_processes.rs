@@ -333,7 +333,10 @@ fn callbacks_have_triggers_durations_waits_and_effects() {
         (11, Some("/robot1/filter"))
     );
     let wait = timer.waits.quantile(0.5).unwrap();
-    assert!((0.4..5.0).contains(&milliseconds(wait)), "{wait:?}");
+    assert!(milliseconds(wait) >= 0.4, "{wait:?}");
+    // On a busy machine, some calls wait longer for a CPU.
+    let (shortest, _) = timer.waits.range().unwrap();
+    assert!(milliseconds(shortest) < 5.0, "{shortest:?}");
 
     let hops = &round.publications;
     assert_eq!(hops.len(), 20);
@@ -368,7 +371,7 @@ fn messages_of_a_publisher_whose_clock_is_ahead_have_waits() {
     robot.attach();
     let mut process = robot.start();
     process.run("init");
-    for ahead in [500, 500, 500, 300].map(Duration::from_millis) {
+    for ahead in [40, 40, 40, 20].map(Duration::from_secs) {
         let source = SystemTime::now().duration_since(UNIX_EPOCH).unwrap() + ahead;
         process.run(&format!("relay {} 0", source.as_nanos()));
     }
@@ -377,10 +380,8 @@ fn messages_of_a_publisher_whose_clock_is_ahead_have_waits() {
         panic!("{report:?}");
     };
     let (_, longest) = callback.waits.range().unwrap();
-    assert!(
-        (150.0..450.0).contains(&milliseconds(longest)),
-        "{longest:?}"
-    );
+    let expected = Duration::from_secs(10)..Duration::from_secs(30);
+    assert!(expected.contains(&longest), "{longest:?}");
 }
 
 /// `rmw_fastrtps_cpp` of Lyrical takes messages of buffer topics without `rmw_take`. The process is
@@ -399,26 +400,33 @@ fn the_period_and_the_wait_of_a_timer_are_read_by_either_steady_clock() {
         let period = Trigger::Timer(Some(Duration::from_millis(1)));
         assert_eq!((timer.calls, &timer.trigger), (20, &period), "{clock}");
         let wait = timer.waits.quantile(0.5).unwrap();
-        assert!(
-            (0.4..5.0).contains(&milliseconds(wait)),
-            "{clock}: {wait:?}"
-        );
+        assert!(milliseconds(wait) >= 0.4, "{clock}: {wait:?}");
+        // On a busy machine, some calls wait longer for a CPU.
+        let (shortest, _) = timer.waits.range().unwrap();
+        assert!(milliseconds(shortest) < 5.0, "{clock}: {shortest:?}");
     }
+}
+
+/// Returns an observed process, which is older than the observation or creates its entities under
+/// it.
+fn attached(is_older: bool) -> (Robot, Process) {
+    let mut robot = Robot::new(248, &[], true);
+    if !is_older {
+        robot.attach();
+    }
+    let mut process = robot.start();
+    if is_older {
+        robot.attach();
+    } else {
+        process.run("init");
+    }
+    (robot, process)
 }
 
 #[test]
 fn messages_taken_without_rmw_take_count_as_subscription_calls() {
     for is_older in [true, false] {
-        let mut robot = Robot::new(248, &[], true);
-        if !is_older {
-            robot.attach();
-        }
-        let mut process = robot.start();
-        if is_older {
-            robot.attach();
-        } else {
-            process.run("init");
-        }
+        let (mut robot, mut process) = attached(is_older);
         process.run("buffers 7 2000");
         let report = robot.report(&process);
         let [callback] = &report.callbacks[..] else {
@@ -434,19 +442,37 @@ fn messages_taken_without_rmw_take_count_as_subscription_calls() {
 }
 
 #[test]
+fn a_request_after_a_message_that_was_not_there_belongs_to_the_service() {
+    for is_older in [true, false] {
+        let (mut robot, mut process) = attached(is_older);
+        process.run("serve 7 2000");
+        let report = robot.report(&process);
+        let [callback] = &report.callbacks[..] else {
+            panic!("{:?}", report.callbacks);
+        };
+        let name = (!is_older).then(|| "/robot1/reset".into());
+        assert_eq!(callback.trigger, Trigger::Service(name));
+        assert_eq!(callback.calls, 7);
+        let taken: u64 = report.subscriptions.iter().map(|of| of.taken).sum();
+        assert_eq!(taken, 0, "{:?}", report.subscriptions);
+    }
+}
+
+#[test]
 fn causal_publications_beyond_the_rate_are_skipped_and_counted() {
     let mut robot = Robot::new(248, &[], true);
     robot.attach();
     let mut process = robot.start();
+    let begun = Instant::now();
     process.run("take 1000");
+    let seconds = usize::try_from(begun.elapsed().as_secs()).unwrap();
     let round = robot.round();
     let reported = round.publications.len();
-    // The calls take some milliseconds, so they belong to two seconds at most.
-    assert!(
-        [1, 2]
-            .map(|seconds| seconds * HOPS_PER_SECOND as usize)
-            .contains(&reported)
-    );
+    // The calls belong to one second more than they take, or two.
+    let per_second = HOPS_PER_SECOND as usize;
+    let expected = per_second..=per_second * (seconds + 2);
+    assert!(expected.contains(&reported), "{reported} {seconds}");
+    assert!(reported < 1000, "{seconds}");
     assert_eq!(robot.counter(Counter::HopsSkipped), 1000 - reported as u64);
     assert_eq!(round.report.processes[0].publishers[0].published, 1000);
 }

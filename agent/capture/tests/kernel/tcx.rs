@@ -8,18 +8,18 @@ use std::os::fd::{AsFd as _, AsRawFd as _, FromRawFd as _, OwnedFd};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, ensure};
-use ros2probe_capture::bpf::count_programs;
 use ros2probe_capture::filter::{Filter, FilterSettings};
-use ros2probe_capture::interfaces::{Interfaces, Selection};
+use ros2probe_capture::interfaces::Selection;
 use ros2probe_capture::netns;
 use ros2probe_capture::reassembly::Limits;
 use ros2probe_capture::settings::WireChoice;
 use ros2probe_capture::system::Clocks;
-use ros2probe_capture::tcx::{self, BPF_TCX_EGRESS, BPF_TCX_INGRESS, Tcx, TcxError};
+use ros2probe_capture::tcx::{self, Tcx, TcxError};
 use ros2probe_capture::wire_tap::{WireTap, WireTapSettings};
 use ros2probe_model::observe::observer::{Observer, Settings};
 use ros2probe_testing::harness::network::{INTERFACE, Link, Namespace};
 use ros2probe_testing::harness::run;
+use ros2probe_testing::harness::tcx::{attached, interface_index, wait_attached};
 use ros2probe_testing::program_run;
 use ros2probe_wire::filter::Counter;
 use ros2probe_wire::record::Verdict;
@@ -36,7 +36,7 @@ const MAX_PROGRAMS: usize = 64;
 /// Index of the loopback interface in every network namespace.
 const LOOPBACK: u32 = 1;
 /// Maximum wait for a packet.
-const PATIENCE: Duration = Duration::from_secs(5);
+const PATIENCE: Duration = Duration::from_secs(60);
 
 /// Returns whether this kernel has tcx. Without it, the tests of this module have nothing to test.
 fn has_tcx() -> bool {
@@ -66,26 +66,6 @@ fn tap(host: &Namespace, wire: WireChoice) -> Result<WireTap> {
     filter.set_interest(METERED, Some(Verdict::Meter))?;
     filter.set_interest(CAPTURED, Some(Verdict::Capture))?;
     Ok(tap)
-}
-
-/// Returns the programs at an interface of a host, for received and for sent packets.
-fn attached(host: &Namespace, interface: &str) -> Result<[u32; 2]> {
-    let count = netns::within(&host.network(), || -> Result<[u32; 2]> {
-        let index = index_of(interface)?;
-        let [ingress, egress] = [BPF_TCX_INGRESS, BPF_TCX_EGRESS];
-        Ok([
-            count_programs(index, ingress)?,
-            count_programs(index, egress)?,
-        ])
-    })?;
-    count.with_context(|| format!("{interface} of {}", host.name()))
-}
-
-/// Returns the index of an interface of the calling thread's namespace.
-fn index_of(interface: &str) -> Result<u32> {
-    let interfaces = Interfaces::open()?;
-    let found = interfaces.iter().find(|it| it.name == interface);
-    Ok(found.context("the interface does not exist")?.index)
 }
 
 /// Loads a program that only passes packets on.
@@ -125,17 +105,6 @@ fn other_program() -> Result<OwnedFd> {
     );
     // SAFETY: the descriptor is new and has no other owner.
     Ok(unsafe { OwnedFd::from_raw_fd(i32::try_from(program)?) })
-}
-
-/// Waits for the number of programs: the kernel removes links shortly after their last descriptor
-/// is closed.
-fn wait_attached(host: &Namespace, interface: &str, programs: [u32; 2]) -> Result<()> {
-    let deadline = Instant::now() + PATIENCE;
-    while attached(host, interface)? != programs {
-        ensure!(Instant::now() < deadline, "not {programs:?} programs");
-        std::thread::sleep(Duration::from_millis(10));
-    }
-    Ok(())
 }
 
 fn socket(host: &Namespace, address: Ipv4Addr) -> Result<UdpSocket> {
@@ -340,7 +309,7 @@ fn programs_before_and_after_still_run_and_nothing_stays_behind() -> Result<()> 
         let filter = Filter::load_tcx(&FilterSettings::default())?;
         let programs = filter.tcx_programs().context("no programs")?;
         let mut tcx = Tcx::new(programs)?;
-        let attach = || -> Result<()> { Ok(tcx.attach(index_of(INTERFACE)?)?) };
+        let attach = || -> Result<()> { Ok(tcx.attach(interface_index(INTERFACE)?)?) };
         netns::within(&robot.network(), attach)??;
         Ok((filter, tcx))
     };
@@ -362,13 +331,13 @@ fn programs_before_and_after_still_run_and_nothing_stays_behind() -> Result<()> 
     let seen = [frames(&before)?, frames(tap.filter())?, frames(&after)?];
     ensure!(seen[0] > 0 && seen == [seen[0]; 3], "{seen:?}");
     drop(tap);
-    wait_attached(robot, INTERFACE, [2, 2])?;
-    wait_attached(robot, "lo", [0, 0])?;
+    wait_attached(robot, INTERFACE, [2, 2], PATIENCE)?;
+    wait_attached(robot, "lo", [0, 0], PATIENCE)?;
     exchange(&sockets[0], &sockets[1])?;
     ensure!(frames(&before)? == frames(&after)?);
     ensure!(frames(&before)? > seen[0], "they run on");
     drop((before_links, after_links));
-    wait_attached(robot, INTERFACE, [0, 0])
+    wait_attached(robot, INTERFACE, [0, 0], PATIENCE)
 }
 
 #[test]
@@ -430,7 +399,7 @@ fn a_later_interface_is_observed_until_it_leaves_the_namespace() -> Result<()> {
             other.name()
         ))?;
         poll()?;
-        wait_attached(&other, "late", [0, 0])?;
+        wait_attached(&other, "late", [0, 0], PATIENCE)?;
         ensure!(attached(&host, "far")? == [1, 1]);
         Ok(())
     })?

@@ -41,6 +41,7 @@ mod ends;
 mod processes;
 mod quic;
 mod rtps;
+mod send_queue;
 mod tapped;
 mod verdicts;
 
@@ -129,8 +130,17 @@ impl Observed {
 
     /// Reads the chunks since the last call as the live source does.
     fn seen(&mut self) -> BTreeMap<StreamId, Seen> {
+        let chunks = self.chunks();
+        self.read(chunks)
+    }
+
+    /// Reads chunks as the live source does.
+    fn read(&mut self, chunks: Vec<(Piece, Vec<u8>)>) -> BTreeMap<StreamId, Seen> {
         let mut seen = BTreeMap::new();
-        for (piece, bytes) in self.chunks() {
+        for (piece, bytes) in chunks {
+            if piece.chunk & chunk::CLIENT_HELLO != 0 {
+                continue;
+            }
             assert_ne!(piece.flags & flag::STREAM, 0, "{piece:?}");
             let chunk = Chunk::of_piece(&piece, &bytes, Timestamp(piece.time));
             self.streams.chunk(&chunk, |report| note(&mut seen, report));
@@ -461,7 +471,15 @@ fn no_bytes_of_other_connections_leave_the_kernel() -> Result<()> {
             pass(&mut connection, index % 2 == 0, part)?;
         }
     }
-    assert_eq!(observed.chunks(), []);
+    // Each side has sent a hello of a client of TLS, of which only the addresses are passed on.
+    let chunks = observed.chunks();
+    let is_hello = |(piece, bytes): &(Piece, Vec<u8>)| {
+        piece.chunk & chunk::CLIENT_HELLO != 0 && bytes.is_empty()
+    };
+    assert!(
+        chunks.len() == 2 && chunks.iter().all(is_hello),
+        "{chunks:?}"
+    );
     assert_eq!(observed.counter(Counter::ZenohChunks)?, 0);
     assert_eq!(observed.counter(Counter::ZenohConnections)?, 0);
     let candidates = observed.counter(Counter::ZenohCandidates)?;

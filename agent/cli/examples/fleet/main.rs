@@ -232,15 +232,16 @@ fn with_own_files(program: &str) -> Vec<String> {
 /// Starts the agent of a robot. Its watchlist is the default one, with an expectation.
 fn agent<'a>(robot: &'a Robot, program: &Path, own: &Path) -> Result<Agent<'a>> {
     std::fs::create_dir_all(own.join("state"))?;
+    let centre = robot.uplink.address();
     let text = format!(
         "watch: ['/**', {{topic: /points, max_loss_ratio: 0.01}}]\n\
          capture: {{source: host, cgroup: {}}}\n\
          api: {{socket: 'off'}}\n\
          state_directory: {}\n\
-         remote_write: {{url: 'http://{}:{PROMETHEUS}/api/v1/write', instance: {}}}\n",
+         remote_write: {{url: 'http://{centre}:{PROMETHEUS}/api/v1/write', instance: {}}}\n\
+         fleet: {{engine: 'http://{centre}:{PROMETHEUS}', reach_s: 20}}\n",
         robot.link.robot.cgroup().display(),
         own.join("state").display(),
-        robot.uplink.address(),
         robot.name
     );
     let configuration = own.join("ros2probe.yaml");

@@ -481,8 +481,19 @@ pub(super) mod tests {
 
     /// Returns a graph of participants and of topics, each with a publisher.
     pub(in super::super) fn graph(participants: u32, topics: &[&'static str]) -> Line<'static> {
-        let participants = (1..=participants)
-            .map(|id| Participant(id, String::new(), 0, "".into(), None, None, None, None));
+        let participants = (1..=participants).map(|id| {
+            Participant(
+                id,
+                String::new(),
+                0,
+                "".into(),
+                None,
+                None,
+                None,
+                None,
+                None,
+            )
+        });
         let topic = |(id, name): (u32, &&'static str)| {
             let types = vec!["std_msgs/msg/String".into()];
             let name = (*name).into();

@@ -240,6 +240,8 @@ struct Session {
     run: Run,
     began: Instant,
     guard: Child,
+    /// Whether the command has ended.
+    is_over: bool,
     next_progress: Duration,
 }
 
@@ -268,6 +270,7 @@ impl Session {
             },
             guard: guard::start(command)?,
             began: Instant::now(),
+            is_over: false,
             next_progress: PROGRESS_INTERVAL,
         })
     }
@@ -288,21 +291,27 @@ impl Session {
                 Ok(mut lines) => self.follow(agent, &mut lines, signals)?,
                 Err(error) => Ended::Stream(error.to_string()),
             };
-            let reason = match ended {
-                Ended::Command => return Ok(()),
-                Ended::Stream(reason) => reason,
+            let (reason, is_broken) = match ended {
+                Ended::Command => ("the agent ended".to_owned(), false),
+                Ended::Stream(reason) => (reason, true),
             };
+            let is_over = self.has_ended(signals)?;
+            let deadline = Instant::now() + LAST_STATE_TIMEOUT;
+            // The kernel closes the sockets of a killed agent before its end can be seen.
+            while is_over && is_broken && !process.has_ended() && Instant::now() < deadline {
+                std::thread::sleep(POLL_INTERVAL);
+            }
             if process.has_ended() {
                 let reason = process.reason().unwrap_or(reason);
                 print(&format!("the agent has ended: {reason}"));
                 self.run.agent_ended = Some((self.now(), reason));
                 break;
             }
-            // The agent of a busy machine may answer late.
-            self.seen.restart();
-            if self.has_ended(signals)? {
+            if is_over {
                 return Ok(());
             }
+            // The agent of a busy machine may answer late.
+            self.seen.restart();
             std::thread::sleep(POLL_INTERVAL);
         }
         while !self.has_ended(signals)? {
@@ -329,7 +338,6 @@ impl Session {
                 Ok(Next::Line(line)) => line,
                 Ok(Next::Nothing) => continue,
                 Ok(Next::End) => return Ok(Ended::Stream("the agent ended".to_owned())),
-                Err(_) if deadline.is_some() => return Ok(Ended::Command),
                 Err(error) => return Ok(Ended::Stream(error.to_string())),
             };
             let Ok(line) = serde_json::from_slice::<Line<'static>>(&line) else {
@@ -384,7 +392,10 @@ impl Session {
             return Ok(false);
         };
         self.run.code = guard::code(status);
-        self.run.seconds = self.now();
+        if !self.is_over {
+            self.run.seconds = self.now();
+        }
+        self.is_over = true;
         Ok(true)
     }
 }

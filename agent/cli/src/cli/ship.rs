@@ -8,6 +8,7 @@ use std::sync::Arc;
 use anyhow::{Context as _, Result};
 use clap::Args;
 use ros2probe::client::{Agent, Target};
+use ros2probe::fleet::size;
 use ros2probe_daemon::agent::DEFAULT_CONFIG;
 use ros2probe_daemon::config::{Config, SocketChoice};
 use ros2probe_daemon::escape::visible_lines;
@@ -167,16 +168,6 @@ fn line(uploading: &Uploading) -> String {
     format!("{bag}: {} of {}", size(*done_bytes), size(*bytes))
 }
 
-/// Returns a number of bytes with a unit.
-fn size(bytes: u64) -> String {
-    const SIZE_UNITS: [(u64, &str); 3] = [(1 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB")];
-    let unit = SIZE_UNITS.iter().find(|(unit, _)| bytes >= *unit);
-    match unit {
-        Some((unit, name)) => format!("{:.1} {name}", bytes as f64 / *unit as f64),
-        None => format!("{bytes} B"),
-    }
-}
-
 /// Returns a query for the agent's warnings and errors of a time.
 fn findings(socket: &SocketChoice) -> Findings {
     let target = Target {
@@ -229,11 +220,5 @@ mod tests {
             add(&mut found, b"{\"severity\":\"WARN\"}");
         }
         assert_eq!(found.len(), MAX_FINDINGS);
-    }
-
-    #[test]
-    fn sizes_have_a_unit() {
-        let sizes = [0, 1_023, 1_024, 8 << 20, 3 << 29].map(size);
-        assert_eq!(sizes, ["0 B", "1023 B", "1.0 KiB", "8.0 MiB", "1.5 GiB"]);
     }
 }

@@ -84,7 +84,7 @@ impl Why {
                 break answer;
             }
             if !std::mem::replace(&mut has_said, true) {
-                let seconds = end.saturating_duration_since(now).as_secs();
+                let seconds = whole_seconds(end.saturating_duration_since(now));
                 eprintln!("no late call so far: waiting for at most {seconds} s (Ctrl-C ends)");
             }
             std::thread::sleep(POLL_INTERVAL);
@@ -149,4 +149,20 @@ fn milliseconds(text: &str) -> Result<f64, UserError> {
     let number = text.parse().ok();
     let number = number.filter(|number| (0.0..=3_600_000.0).contains(number));
     number.ok_or_else(|| UserError("a number of milliseconds from 0 to 3600000".to_owned()))
+}
+
+/// Returns a duration in seconds, rounded up.
+const fn whole_seconds(duration: Duration) -> u128 {
+    duration.as_millis().div_ceil(1_000)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_wait_of_less_than_a_second_is_no_wait_of_zero_seconds() {
+        assert_eq!(whole_seconds(Duration::from_millis(987)), 1);
+        assert_eq!(whole_seconds(Duration::from_secs(30)), 30);
+    }
 }

@@ -465,6 +465,20 @@ pub fn absent_addresses(host: &HostState, config: &Config) -> Vec<Finding> {
         .collect()
 }
 
+/// Returns the findings for tokens that are sent without encryption.
+#[must_use]
+pub fn readable_tokens(config: &Config) -> Vec<Finding> {
+    let tokens = config.readable_tokens().into_iter();
+    tokens
+        .map(|token| {
+            let remedy = format!("# in the configuration: {}: https://...", token.address);
+            Finding::new(AREA, "tokens", Severity::Warning, token.to_string())
+                .seen(token.host, token.address)
+                .remedy(remedy)
+        })
+        .collect()
+}
+
 /// Returns the addresses of this host's interfaces; `None` if the kernel does not list them.
 fn local_addresses(host: &HostState) -> Option<BTreeSet<IpAddr>> {
     let [fourth, sixth] = ADDRESS_TABLES;

@@ -4,6 +4,7 @@
 use std::collections::BTreeMap;
 
 use super::answers::Answers;
+use super::shell::{WITHOUT_ICEORYX, WITHOUT_PSMX};
 use crate::top::text::counted;
 use ros2probe_api::Open;
 use ros2probe_api::diagnosis::Diagnosis;
@@ -31,6 +32,7 @@ pub fn check(answers: &Answers, processes: Option<usize>) -> Vec<Finding> {
     findings.extend(restored(participants));
     findings.extend(unknown_writers(answers));
     findings.extend(secured(participants));
+    findings.extend(encrypted(answers.participants.tls_connections));
     findings.extend(announced_unseen(participants));
     findings.extend(off_network_findings(answers));
     findings.extend(mismatches(&answers.topics.topics));
@@ -223,6 +225,26 @@ fn announced_unseen(participants: &[Participant<'_>]) -> Option<Finding> {
     )
 }
 
+/// Returns the finding for connections that are encrypted with TLS.
+fn encrypted(connections: u64) -> Option<Finding> {
+    let sentence = match connections {
+        0 => return None,
+        1 => "1 connection of RTPS over TCP is encrypted with TLS: its topics are not measured"
+            .to_owned(),
+        _ => format!(
+            "{connections} connections of RTPS over TCP are encrypted with TLS: their topics are \
+             not measured"
+        ),
+    };
+    let finding = Finding::new(AREA, "tcp_tls", Severity::Warning, sentence);
+    let finding = finding.seen(connections.to_string(), "GET /participants tls_connections");
+    Some(
+        finding
+            .elsewhere("inside: full    # in `capture`, counts messages by calls in the processes")
+            .elsewhere("<tls>    # or remove it from the transport descriptors of Fast DDS"),
+    )
+}
+
 fn secured(participants: &[Participant<'_>]) -> Option<Finding> {
     let count = participants.iter().filter(|each| each.secured).count();
     if count == 0 {
@@ -260,11 +282,7 @@ fn off_network_findings(answers: &Answers) -> Vec<Finding> {
             transport: "iceoryx",
             severity: Severity::Warning,
             words: ("use", "only iceoryx and cannot be observed"),
-            remedy: Some(|finding| {
-                finding.elsewhere(
-                    "<SharedMemory><Enable>false</Enable></SharedMemory>    # in CYCLONEDDS_URI",
-                )
-            }),
+            remedy: Some(|finding| finding.elsewhere(WITHOUT_ICEORYX).elsewhere(WITHOUT_PSMX)),
         },
         OffNetwork {
             transport: "same_process",
@@ -517,6 +535,46 @@ mod tests {
         {"domain_id":7,"vendor":"Eclipse Cyclone DDS","readers":2}]}"#;
 
     #[test]
+    fn participants_whose_topics_are_announced_by_tls_are_named_and_not_alone() {
+        let participant = r#"{"domain_id":0,"vendor":"eProsima Fast DDS","announces_unseen":true}"#;
+        let both = format!(r#"{{"participants":[{participant},{participant}]}}"#);
+        let findings = check(&answers(&both, "", ""), None);
+        let of = |check| findings.iter().find(|finding| finding.check == check);
+        let sentence = &of("tcp_unseen").unwrap().sentence;
+        assert!(sentence.starts_with("2 participants announce topics and nodes by TCP"));
+        assert_eq!((of("alone"), of("names")), (None, None));
+        // A participant that is alone has none to which it can announce topics.
+        let alone = format!(r#"{{"participants":[{participant}]}}"#);
+        let findings = check(&answers(&alone, "", ""), None);
+        assert_eq!(severity(&findings, "alone"), Some(Severity::Note));
+        assert_eq!(severity(&findings, "tcp_unseen"), None);
+    }
+
+    #[test]
+    fn connections_with_tls_are_a_finding_with_their_number() {
+        let sentence = |count: u64| {
+            let list = WELL.trim_end_matches('}');
+            let findings = check(
+                &answers(&format!("{list},\"tls_connections\":{count}}}"), "", ""),
+                None,
+            );
+            let mut found = findings.into_iter().filter(|each| each.check == "tcp_tls");
+            found.next().map(|found| found.sentence)
+        };
+        assert_eq!(sentence(0), None);
+        assert!(
+            sentence(1)
+                .unwrap()
+                .starts_with("1 connection of RTPS over TCP is encrypted")
+        );
+        assert!(
+            sentence(3)
+                .unwrap()
+                .starts_with("3 connections of RTPS over TCP are encrypted")
+        );
+    }
+
+    #[test]
     fn a_completely_known_graph_leads_to_one_line() {
         let findings = check(&answers(WELL, "", ""), None);
         assert_eq!(findings.len(), 1);
@@ -612,10 +670,17 @@ mod tests {
             severity(&of("data_sharing", ""), "data_sharing"),
             Some(Severity::Warning)
         );
-        assert_eq!(
-            severity(&of("iceoryx", ""), "iceoryx"),
-            Some(Severity::Warning)
-        );
+        let iceoryx = of("iceoryx", "");
+        assert_eq!(severity(&iceoryx, "iceoryx"), Some(Severity::Warning));
+        // The two generations of Cyclone DDS turn it off by different elements.
+        let found = iceoryx.iter().find(|each| each.check == "iceoryx").unwrap();
+        let comments = found
+            .remedies
+            .iter()
+            .filter_map(|each| each.comment.as_deref());
+        let (old, new): (Vec<_>, Vec<_>) = comments.partition(|each| each.ends_with("0.10"));
+        assert_eq!((old.len(), new.len()), (1, 1), "{found:?}");
+        assert!(new[0].ends_with("Cyclone DDS 11"), "{found:?}");
         assert_eq!(
             severity(&of("same_process", ""), "same_process"),
             Some(Severity::Note)

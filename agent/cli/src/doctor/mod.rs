@@ -80,6 +80,7 @@ pub fn examine(host: &HostState, configured: &Configured, reach: &Reach) -> Repo
         Reach::Denied(reason) => agent::absent(host, config, reason, true),
     });
     findings.extend(agent::absent_addresses(host, config));
+    findings.extend(agent::readable_tokens(config));
     findings.extend(match health {
         Some(health) => visibility::check(&Visibility::of_agent(health)),
         None => trial_findings(host, &config.capture),

@@ -5,7 +5,7 @@
 //! the process. Values that a process controls are untrusted: their size is limited here, and they
 //! are escaped in the output.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use super::host_state::{HostState, ReadFailure, base_name};
 use super::variables::{Range, Variables};
@@ -212,13 +212,19 @@ impl Processes {
             own.is_some_and(|implementation| UNREAD_IMPLEMENTATIONS.contains(&implementation))
         };
         let unread: Vec<_> = self.found.iter().filter(unread).collect();
-        let implementation = unread.first()?.implementation?;
+        let implementations = unread.iter().filter_map(|process| process.implementation);
+        let implementations: BTreeSet<_> = implementations.collect();
+        let implementations: Vec<_> = implementations.into_iter().collect();
+        let implementations = implementations.join(" and ");
         let sentence = format!(
-            "messages of {implementation} stay in shared memory that the agent does not read: {}",
+            "messages of {implementations} stay in shared memory that the agent does not read: {}",
             names(&unread)
         );
         let finding = Finding::new(AREA, "unread_rmw", Severity::Warning, sentence);
-        let finding = finding.seen(implementation, format!("/proc/{}/maps", unread.first()?.id));
+        let finding = finding.seen(
+            implementations,
+            format!("/proc/{}/maps", unread.first()?.id),
+        );
         Some(finding.remedy("rp inside    # counts their callbacks, with capture.inside"))
     }
 
@@ -627,6 +633,23 @@ mod tests {
                 "messages of iceoryx2 stay in shared memory that the agent does not read: \
                  talker (11), listener (12)"
             )
+        );
+        let both = found(
+            &[
+                (11, "talker", "ROS_DOMAIN_ID=3", ICEORYX2),
+                (
+                    12,
+                    "camera",
+                    "ROS_DOMAIN_ID=3",
+                    &ICEORYX2.replace("iceoryx2_cxx", "iceoryx_cpp"),
+                ),
+            ],
+            &[],
+        );
+        let both = sentence(&both, "unread_rmw").unwrap();
+        assert!(
+            both.starts_with("messages of iceoryx and iceoryx2 stay"),
+            "{both}"
         );
         let dds = found(&[(11, "talker", "ROS_DOMAIN_ID=3", FAST)], &[]);
         assert_eq!(sentence(&dds, "unread_rmw"), None);

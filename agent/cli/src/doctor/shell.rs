@@ -14,6 +14,12 @@ const LOCAL_PORT_RANGE_PATH: &str = "/proc/sys/net/ipv4/ip_local_port_range";
 /// Maximum offset from the first port, for fifty participants on one host: 11, plus two for each
 /// other.
 const PORTS_OF_50_PARTICIPANTS: u32 = 11 + 2 * 49;
+/// Turns iceoryx off in `CYCLONEDDS_URI`: of Cyclone DDS 0.10, and since 11.0, which has plugins for
+/// it (PSMX).
+pub(super) const WITHOUT_ICEORYX: &str =
+    "<SharedMemory><Enable>false</Enable></SharedMemory>    # in CYCLONEDDS_URI, Cyclone DDS 0.10";
+pub(super) const WITHOUT_PSMX: &str = "<PubSubMessageExchange/>    # remove it from \
+     <General><Interfaces> in CYCLONEDDS_URI, Cyclone DDS 11";
 /// Maximum number of bytes read of an XML profile.
 const MAX_PROFILE: u64 = 256 << 10;
 
@@ -303,18 +309,16 @@ fn cyclone(host: &HostState, variables: &Variables) -> Option<Finding> {
         text.split_once("<Enable>")
             .is_some_and(|(_, rest)| rest.starts_with("true"))
     };
-    Some(if is_on(shared) || text.contains("PubSubMessageExchange") {
-        report(
-            Severity::Warning,
-            "Cyclone DDS uses iceoryx within this host, which the agent cannot see".to_owned(),
-        )
-        .elsewhere("<SharedMemory><Enable>false</Enable></SharedMemory>")
+    let remedy = if text.contains("<PubSubMessageExchange") {
+        WITHOUT_PSMX
+    } else if is_on(shared) {
+        WITHOUT_ICEORYX
     } else {
-        report(
-            Severity::Ok,
-            "Cyclone DDS has its own configuration".to_owned(),
-        )
-    })
+        let sentence = "Cyclone DDS has its own configuration".to_owned();
+        return Some(report(Severity::Ok, sentence));
+    };
+    let sentence = "Cyclone DDS uses iceoryx within this host, which the agent cannot see";
+    Some(report(Severity::Warning, sentence.to_owned()).elsewhere(remedy))
 }
 
 fn security(variables: &Variables) -> Option<Finding> {
@@ -364,6 +368,9 @@ mod tests {
         ),
     ];
 
+    const PSMX: &str = "<General><Interfaces><NetworkInterface autodetermine=\"true\"/>\
+        <PubSubMessageExchange name=\"iox2\" library=\"psmx_iox2\"/></Interfaces></General>";
+
     fn found(variables: &[(&str, &str)]) -> Vec<Finding> {
         let (_directory, mut host) = host(&FILES);
         host.environment = variables
@@ -395,6 +402,20 @@ mod tests {
             found(&[("SUDO_USER", "me")])[0].remedies[0].line,
             "sudo -E rp doctor"
         );
+    }
+
+    #[test]
+    fn the_remedy_for_iceoryx_is_that_of_the_generation_of_cyclone_dds() {
+        for (value, remedy) in [
+            ("file:///home/cyclone.xml", WITHOUT_ICEORYX),
+            (PSMX, WITHOUT_PSMX),
+        ] {
+            let findings = found(&[("ROS_DISTRO", "jazzy"), ("CYCLONEDDS_URI", value)]);
+            let finding = findings.iter().find(|each| each.check == "cyclonedds");
+            let found = &finding.unwrap().remedies[0];
+            let comment = found.comment.as_deref().unwrap();
+            assert_eq!(format!("{}    # {comment}", found.line), remedy);
+        }
     }
 
     #[test]
@@ -497,6 +518,7 @@ mod tests {
             Severity::Problem,
         );
         gives("CYCLONEDDS_URI", "<General/>", "cyclonedds", Severity::Ok);
+        gives("CYCLONEDDS_URI", PSMX, "cyclonedds", warning);
         gives("ROS_SECURITY_ENABLE", "true", "security", note);
         gives(
             "ROS_SECURITY_KEYSTORE",

@@ -4,14 +4,12 @@ use std::fmt::Write as _;
 use std::time::Duration;
 
 use jiff::Timestamp;
-use percent_encoding::{NON_ALPHANUMERIC, utf8_percent_encode};
 use quick_xml::escape::escape;
+use ros2probe_api::fleet::{Fleet, Incidents, Robot, State};
 
-use super::robot::{Fleet, Robot, State};
+use super::incidents;
 use super::text::{cells, fault_count, faults};
 
-/// The place of a robot's name in a [`Link`].
-const ROBOT: &str = "{robot}";
 /// Maximum number of lines about one robot.
 const MAX_FAULTS: usize = 200;
 const STYLE: &str = include_str!("../ci/report.css");
@@ -27,42 +25,10 @@ pub(super) struct Content<'a> {
     pub fleet: Option<(&'a Fleet, Timestamp)>,
     /// Why the last request to the engine failed.
     pub problem: Option<&'a str>,
+    /// Incidents of the robots; `None` without a store.
+    pub incidents: Option<&'a Incidents>,
     /// Pause after which the browser reads the page again; `None` = never.
     pub refresh: Option<Duration>,
-    /// The page of a robot.
-    pub link: Option<&'a Link>,
-}
-
-/// The address of a robot's own page.
-#[derive(Clone, Debug)]
-pub struct Link(String);
-
-/// A text is not the address of robots' pages.
-#[derive(Debug, thiserror::Error)]
-#[error("`{0}` is no URL with {ROBOT}, as in `http://{ROBOT}.example:17401/`")]
-pub struct InvalidLink(String);
-
-impl std::str::FromStr for Link {
-    type Err = InvalidLink;
-
-    fn from_str(text: &str) -> Result<Self, Self::Err> {
-        let is_web = ["http://", "https://"]
-            .iter()
-            .any(|it| text.starts_with(it));
-        match is_web && text.contains(ROBOT) {
-            true => Ok(Self(text.to_owned())),
-            false => Err(InvalidLink(text.to_owned())),
-        }
-    }
-}
-
-impl Link {
-    fn of(&self, robot: &str) -> String {
-        // Host names have hyphens and dots.
-        const ENCODED: &percent_encoding::AsciiSet = &NON_ALPHANUMERIC.remove(b'-').remove(b'.');
-        let name = utf8_percent_encode(robot, ENCODED).to_string();
-        self.0.replace(ROBOT, &name)
-    }
 }
 
 /// Returns the page.
@@ -87,8 +53,11 @@ pub(super) fn html(content: &Content<'_>) -> String {
     }
     time(&mut page, content);
     if !robots.is_empty() {
-        table(&mut page, robots, content.link);
+        table(&mut page, robots);
         details(&mut page, robots);
+    }
+    if let Some(incidents) = content.incidents {
+        incident_table(&mut page, incidents);
     }
     page.push_str("</body></html>\n");
     page
@@ -151,7 +120,7 @@ const fn class(state: State) -> &'static str {
     }
 }
 
-fn table(page: &mut String, robots: &[Robot], link: Option<&Link>) {
+fn table(page: &mut String, robots: &[Robot]) {
     page.push_str(
         "<div class=\"wide\"><table><thead><tr><th scope=\"col\">Robot</th><th scope=\"col\">State</th>\
          <th scope=\"col\">Last sample</th><th scope=\"col\" class=\"n\">Nodes</th>\
@@ -161,8 +130,8 @@ fn table(page: &mut String, robots: &[Robot], link: Option<&Link>) {
     for (place, robot) in robots.iter().enumerate() {
         let [name, state, seen, nodes, topics, loss, version] = cells(robot);
         let (name, version) = (escape(&*name), escape(&*version));
-        let name = match link.map(|link| link.of(&robot.name)) {
-            Some(address) => format!("<a href=\"{}\">{name}</a>", escape(&*address)),
+        let name = match &robot.page {
+            Some(address) => format!("<a href=\"{}\">{name}</a>", escape(address)),
             None => name.into_owned(),
         };
         let details = match fault_count(robot) {
@@ -206,29 +175,80 @@ fn details(page: &mut String, robots: &[Robot]) {
     }
 }
 
+fn incident_table(page: &mut String, incidents: &Incidents) {
+    page.push_str("<h2>Incidents</h2>\n");
+    if let Some(problem) = &incidents.problem {
+        let problem = escape(problem);
+        let _ = writeln!(
+            page,
+            "<p class=\"bad\" role=\"alert\">The store cannot be read: {problem}</p>"
+        );
+    }
+    let all = incidents::of(incidents, None);
+    if !all.is_empty() {
+        page.push_str(
+            "<div class=\"wide\"><table><thead><tr><th scope=\"col\">Begin</th><th scope=\"col\">Robot</th>\
+             <th scope=\"col\">Trigger</th><th scope=\"col\" class=\"n\">Length</th>\
+             <th scope=\"col\" class=\"n\">Size</th><th scope=\"col\">Bag</th>\
+             <th scope=\"col\">Findings</th></tr></thead><tbody>\n",
+        );
+    }
+    for incident in &all {
+        let cells = incidents::cells(incident);
+        let [begin, robot, trigger, length, size, bag] =
+            cells.each_ref().map(|cell| escape(cell.as_str()));
+        let details = incidents::details(incident).join("; ");
+        let details = escape(&*details);
+        let _ = writeln!(
+            page,
+            "<tr><td>{begin}</td><td>{robot}</td><td>{trigger}</td><td class=\"n\">{length}</td>\
+             <td class=\"n\">{size}</td><td>{bag}</td><td>{details}</td></tr>"
+        );
+    }
+    if !all.is_empty() {
+        page.push_str("</tbody></table></div>\n");
+    }
+    for note in incidents::notes(incidents, all.len(), 0) {
+        let _ = writeln!(page, "<p><small>{note}</small></p>");
+    }
+}
+
 #[cfg(test)]
 mod tests {
+    use ros2probe_api::fleet::{Difference, Part};
+    use ros2probe_daemon::fleet::Link;
+
+    use super::super::text::tests::sample;
     use super::*;
 
     #[test]
     fn names_of_robots_are_escaped_and_link_to_their_pages() {
+        let link: Link = "https://{robot}.example/?to={robot}".parse().unwrap();
         let robot = |name: &str, state| Robot {
             version: Some("<i>".to_owned()),
-            ..Robot::sample(name, state, 2.0)
+            page: Some(link.of(name)),
+            ..sample(name, state, 2.0)
         };
         let mut hostile = robot("a\"><script>alert(1)</script>", State::Violated);
         hostile.violated = vec![("/<b>".to_owned(), "min_rate_hz".to_owned())];
         let fleet = Fleet {
             robots: vec![hostile, robot("robot-2.site", State::Ok)],
+            ..Fleet::default()
         };
-        let link = "https://{robot}.example/?to={robot}".parse().unwrap();
+        let mut incident = super::super::incidents::tests::sample("<em>");
+        incident.bag = "<tt>".to_owned();
+        let incidents = Incidents {
+            problem: Some("<del>".to_owned()),
+            bags: vec![incident],
+            ..Incidents::default()
+        };
         let page = html(&Content {
             fleet: Some((&fleet, Timestamp::UNIX_EPOCH)),
             problem: Some("<u>"),
+            incidents: Some(&incidents),
             refresh: Some(Duration::from_secs(10)),
-            link: Some(&link),
         });
-        for hostile in ["<script", "<b>", "<i>", "<u>"] {
+        for hostile in ["<script", "<b>", "<i>", "<u>", "<em>", "<tt>", "<del>"] {
             assert!(!page.contains(hostile), "{hostile}: {page}");
         }
         for part in [
@@ -239,35 +259,37 @@ mod tests {
             "<td class=\"n\">1.25 %</td>",
             "State of 1970-01-01 00:00:00 UTC",
             "http-equiv=\"refresh\" content=\"10\"",
+            "The store cannot be read: &lt;del&gt;",
+            "<td>message_lost /scan</td><td class=\"n\">7.5 s</td><td class=\"n\">3.0 MiB</td>",
         ] {
             assert!(page.contains(part), "{part}: {page}");
-        }
-        for text in ["ftp://{robot}/", "http://robot/", "javascript:{robot}"] {
-            assert!(text.parse::<Link>().is_err(), "{text}");
         }
     }
 
     #[test]
     fn a_robot_with_many_differences_has_a_last_line_with_their_number() {
-        let difference = |number: usize| super::super::Difference {
+        let difference = |number: usize| Difference {
+            part: Part::Nodes,
             what: format!("node /n{number}"),
             here: None,
             usual: Some("present".to_owned()),
             robots: 2,
             of: 3,
+            text: format!("node /n{number} is missing"),
         };
         let robot = Robot {
             differences: (0..MAX_FAULTS + 7).map(difference).collect(),
-            ..Robot::sample("robot", State::Ok, 2.0)
+            ..sample("robot", State::Ok, 2.0)
         };
         let fleet = Fleet {
             robots: vec![robot],
+            ..Fleet::default()
         };
         let page = html(&Content {
             fleet: Some((&fleet, Timestamp::UNIX_EPOCH)),
             problem: None,
+            incidents: None,
             refresh: None,
-            link: None,
         });
         assert_eq!(page.matches("<li>").count(), MAX_FAULTS + 1);
         assert!(page.contains("and 7 more: see"), "{page}");
@@ -278,8 +300,8 @@ mod tests {
         let page = html(&Content {
             fleet: None,
             problem: None,
+            incidents: None,
             refresh: None,
-            link: None,
         });
         assert!(page.contains("The engine has not answered yet."), "{page}");
         assert!(

@@ -3,8 +3,8 @@
 use std::convert::Infallible;
 use std::io;
 use std::net::{SocketAddr, TcpListener};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
-use std::time::{Duration, Instant};
+use std::sync::Arc;
+use std::time::Duration;
 
 use bytes::Bytes;
 use http_body_util::Full;
@@ -17,26 +17,21 @@ use hyper::service::service_fn;
 use hyper::{Method, Request, Response, StatusCode};
 use hyper_util::rt::{TokioIo, TokioTimer};
 use jiff::Timestamp;
-use ros2probe_capture::error_chain::in_words;
+use ros2probe_api::fleet::Fleet;
+use ros2probe_daemon::fleet::{Known, Link, POLL_INTERVAL, Reader, Sources};
 use ros2probe_daemon::surface::authority;
 use tokio::runtime::Builder;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::Semaphore;
 use tokio::time::timeout;
 
-use super::engine::Engine;
-use super::page::{Content, Link, html};
-use super::robot::{Fleet, Question};
+use super::page::{Content, html};
 
 /// Maximum number of connections. Further ones wait.
 const MAX_CONNECTIONS: usize = 64;
 /// Maximum time for the header of a request, and for a whole connection.
 const HEADER_TIMEOUT: Duration = Duration::from_secs(5);
 const CONNECTION_TIMEOUT: Duration = Duration::from_secs(30);
-/// Pause between two readings of the engine.
-const POLL_INTERVAL: Duration = Duration::from_secs(10);
-/// Time after a request in which the engine is read.
-const DEMAND_LIFETIME: Duration = Duration::from_secs(60);
 /// Maximum age of the state that `/fleet.json` has.
 const MAX_AGE: Duration = Duration::from_secs(30);
 /// Pause before the browser reads the page again while the engine has not answered.
@@ -66,20 +61,6 @@ pub enum PageError {
     /// No runtime or thread starts.
     #[error("cannot serve the page")]
     Serve(#[from] io::Error),
-}
-
-/// Last answers of the engine, and the time of the last request for the page.
-#[derive(Clone, Debug, Default)]
-struct Known {
-    fleet: Option<(Arc<Fleet>, Timestamp)>,
-    problem: Option<Arc<str>>,
-    asked: Option<Instant>,
-}
-
-#[derive(Debug, Default)]
-struct Shared {
-    known: Mutex<Known>,
-    changed: Condvar,
 }
 
 impl Page {
@@ -115,19 +96,19 @@ impl Page {
     /// # Errors
     ///
     /// Fails if no runtime or thread starts.
-    pub fn serve(self, engine: Engine, question: Question) -> Result<(), PageError> {
-        let shared = Arc::<Shared>::default();
-        let polled = Arc::clone(&shared);
+    pub fn serve(self, sources: Sources) -> Result<(), PageError> {
+        let reader = Arc::new(Reader::new(self.link, &sources));
+        let polled = Arc::clone(&reader);
+        let polling = Builder::new_current_thread().enable_all().build()?;
         let thread = std::thread::Builder::new().name("engine".to_owned());
-        thread.spawn(move || polled.poll(&engine, &question))?;
+        thread.spawn(move || polling.block_on(polled.poll(sources)))?;
         let runtime = Builder::new_current_thread().enable_all().build()?;
-        let link = self.link.map(Arc::new);
         runtime.block_on(async {
             let listener = tokio::net::TcpListener::from_std(self.listener)?;
             let mut terminated = signal(SignalKind::terminate())?;
             let mut interrupted = signal(SignalKind::interrupt())?;
             tokio::select! {
-                () = accept(listener, shared, link) => {}
+                () = accept(listener, reader) => {}
                 _ = terminated.recv() => {}
                 _ = interrupted.recv() => {}
             }
@@ -136,45 +117,7 @@ impl Page {
     }
 }
 
-impl Shared {
-    fn known(&self) -> MutexGuard<'_, Known> {
-        self.known.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// Queries the engine while a browser has the page open.
-    fn poll(&self, engine: &Engine, question: &Question) {
-        loop {
-            let is_unasked = |known: &mut Known| {
-                known
-                    .asked
-                    .is_none_or(|asked| asked.elapsed() >= DEMAND_LIFETIME)
-            };
-            let waited = self.changed.wait_while(self.known(), is_unasked);
-            drop(waited);
-            let read = Fleet::read(engine, question);
-            let mut known = self.known();
-            match read {
-                Ok(fleet) => {
-                    known.fleet = Some((Arc::new(fleet), Timestamp::now()));
-                    known.problem = None;
-                }
-                Err(error) => known.problem = Some(in_words(&error).into()),
-            }
-            drop(known);
-            std::thread::sleep(POLL_INTERVAL);
-        }
-    }
-
-    /// Returns what is known, and lets the engine be read.
-    fn ask(&self) -> Known {
-        let mut known = self.known();
-        known.asked = Some(Instant::now());
-        self.changed.notify_one();
-        known.clone()
-    }
-}
-
-async fn accept(listener: tokio::net::TcpListener, shared: Arc<Shared>, link: Option<Arc<Link>>) {
+async fn accept(listener: tokio::net::TcpListener, reader: Arc<Reader>) {
     let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
     loop {
         // The semaphore is never closed.
@@ -186,10 +129,10 @@ async fn accept(listener: tokio::net::TcpListener, shared: Arc<Shared>, link: Op
             tokio::time::sleep(Duration::from_millis(100)).await;
             continue;
         };
-        let (shared, link) = (Arc::clone(&shared), link.clone());
+        let reader = Arc::clone(&reader);
         tokio::spawn(async move {
             let answer = service_fn(|request: Request<Incoming>| {
-                let response = response(&request, &shared, link.as_deref());
+                let response = response(&request, &reader);
                 async { Ok::<_, Infallible>(response) }
             });
             let mut server = http1::Builder::new();
@@ -205,11 +148,7 @@ async fn accept(listener: tokio::net::TcpListener, shared: Arc<Shared>, link: Op
     }
 }
 
-fn response(
-    request: &Request<Incoming>,
-    shared: &Shared,
-    link: Option<&Link>,
-) -> Response<Full<Bytes>> {
+fn response(request: &Request<Incoming>, reader: &Reader) -> Response<Full<Bytes>> {
     if authority::own(request.headers()).is_err() {
         return refusal(
             StatusCode::FORBIDDEN,
@@ -225,7 +164,12 @@ fn response(
     }
     match request.uri().path() {
         "/" => {
-            let Known { fleet, problem, .. } = shared.ask();
+            let Known {
+                fleet,
+                problem,
+                incidents,
+                ..
+            } = reader.ask();
             let is_paused = request.uri().query() == Some("paused");
             let refresh = match fleet {
                 Some(_) => POLL_INTERVAL,
@@ -234,13 +178,18 @@ fn response(
             let page = html(&Content {
                 fleet: fleet.as_ref().map(|(fleet, at)| (&**fleet, *at)),
                 problem: problem.as_deref(),
+                incidents: incidents.as_deref(),
                 refresh: (!is_paused).then_some(refresh),
-                link,
             });
             answer(StatusCode::OK, "text/html; charset=utf-8", page)
         }
         "/fleet.json" => {
-            let Known { fleet, problem, .. } = shared.ask();
+            let Known {
+                fleet,
+                problem,
+                incidents,
+                ..
+            } = reader.ask();
             let is_fresh = |at: &Timestamp| {
                 let age = Timestamp::now().duration_since(*at);
                 age.unsigned_abs() < MAX_AGE
@@ -252,7 +201,11 @@ fn response(
                 return refusal(StatusCode::SERVICE_UNAVAILABLE, &format!("{problem}\n"));
             };
             // Numbers and texts cannot fail to serialize.
-            let text = serde_json::to_string_pretty(&*fleet).unwrap_or_default();
+            let fleet = Fleet {
+                incidents: incidents.as_deref().cloned(),
+                ..(*fleet).clone()
+            };
+            let text = serde_json::to_string_pretty(&fleet).unwrap_or_default();
             answer(StatusCode::OK, "application/json", text + "\n")
         }
         _ => refusal(StatusCode::NOT_FOUND, "only / and /fleet.json\n"),

@@ -370,7 +370,10 @@ impl Streams {
         for publisher in &mut self.publishers {
             publisher.process.terminate()?;
         }
-        std::thread::sleep(Duration::from_millis(500));
+        for (publisher, subscriber) in self.publishers.iter().zip(&self.subscribers) {
+            let sent = publisher.log()?.sequences("pub").len() as u64;
+            subscriber.wait_settled(sent)?;
+        }
         let host = self
             .subscribers
             .first()
@@ -419,7 +422,7 @@ fn run_stream(link: &Link, stream: &Stream) -> Result<()> {
     subscriber.wait_matched()?;
     publisher.start_sending()?;
     publisher.wait_sent(PATIENCE)?;
-    std::thread::sleep(Duration::from_millis(300));
+    subscriber.wait_received(stream.count)?;
     let received = subscriber.log()?.writer_numbers("sub")?.len() as u64;
     ensure!(received == stream.count, "{received} received");
     Ok(())

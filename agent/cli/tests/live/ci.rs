@@ -6,7 +6,7 @@ use std::fs::{self, File, Permissions};
 use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, ensure};
 use quick_xml::Reader;
@@ -18,6 +18,7 @@ use ros2probe_testing::harness::loss::Loss;
 use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream, robot};
 use ros2probe_testing::harness::process::Process;
+use ros2probe_testing::harness::snmp::Snmp;
 use ros2probe_testing::harness::wait_until;
 use ros2probe_testing::robot_log;
 use tempfile::TempDir;
@@ -154,21 +155,26 @@ fn report(place: &Place) -> Result<String> {
     Ok(page)
 }
 
-/// Returns a script that runs a publisher and a subscriber of `/imu` for some seconds. RustDDS
-/// drops samples that its history overwrites before they are sent, so the history covers a busy
-/// machine.
+/// Returns a script that runs a publisher and a subscriber of `/imu` for some seconds.
 fn healthy(seconds: u32) -> Result<String> {
+    healthy_during(&format!("sleep {seconds}"))
+}
+
+/// Returns a script that runs a publisher and a subscriber of `/imu` until this command ends.
+/// RustDDS drops samples that its history overwrites before they are sent, so the history covers a
+/// busy machine.
+fn healthy_during(command: &str) -> Result<String> {
     let robot = robot()?.display().to_string();
     let peer = |role: &str, node: &str| {
         format!(
-            "{robot} --role {role} --topic /imu --size 320 --rate 50 --depth 200 --best-effort \
+            "{robot} --role {role} --topic /imu --size 320 --rate 50 --depth 1000 --best-effort \
              --node {node} \
              >&2 &"
         )
     };
     let (listens, sends) = (peer("sub", "/ekf"), peer("pub", "/driver"));
     Ok(format!(
-        "{listens} A=$!; {sends} B=$!; sleep {seconds}; kill $A $B; wait; exit 0"
+        "{listens} A=$!; {sends} B=$!; {command}; kill $A $B; wait; exit 0"
     ))
 }
 
@@ -176,7 +182,7 @@ fn healthy(seconds: u32) -> Result<String> {
 fn a_healthy_robot_passes_and_leaves_complete_artefacts() -> Result<()> {
     let host = Namespace::isolated()?;
     let place = Place::new(&format!(
-        "{}watch:\n  - {{topic: /imu, min_rate_hz: 20, max_silence_s: 2, publishers: 1}}\n",
+        "{}watch:\n  - {{topic: /imu, min_rate_hz: 1, max_silence_s: 10, publishers: 1}}\n",
         at_the_sockets_of(&host)
     ))?;
     let mut process = place.start(&host, &["--fail-on", "warning"], &healthy(14)?)?;
@@ -220,10 +226,7 @@ fn lost_messages_and_a_low_rate_fail_by_the_name_of_the_topic() -> Result<()> {
         "{}watch:\n  - {{topic: /imu, min_rate_hz: 5000}}\n  - {{topic: /odom, publishers: 1}}\n",
         at_the_sockets_of(&link.monitor)
     ))?;
-    let stream = Stream {
-        depth: 10,
-        ..Stream::small(1_000_000)
-    };
+    let stream = Stream::small(1_000_000);
     let script = format!(
         "{} --role sub --topic /imu --size 320 --best-effort --node /ekf >&2 & A=$!
          echo began; read line; kill $A; wait; exit 0",
@@ -299,7 +302,7 @@ fn a_bag_that_cannot_be_kept_does_not_lose_the_verdict() -> Result<()> {
 fn hostile_names_are_escaped_in_every_artefact() -> Result<()> {
     let link = Link::new()?;
     let place = Place::new(ON_THE_WIRE)?;
-    let script = "echo began; sleep 6";
+    let script = "echo began; read line";
     let mut process = place.start(&link.monitor, &["--settle", "1"], script)?;
     process.wait_for("began", PATIENCE)?;
     // The agent refuses names with quotation marks and control characters.
@@ -310,6 +313,7 @@ fn hostile_names_are_escaped_in_every_artefact() -> Result<()> {
         node.send(&robot_log::log(20, "x", format!("{number}").as_bytes()))?;
         std::thread::sleep(Duration::from_millis(100));
     }
+    process.write_line("end")?;
     process.wait(PATIENCE)?;
     let cases = Cases::read(&place.path("out/junit.xml"))?;
     let shown = hostile.replace('\u{200f}', "\\u{200f}");
@@ -371,7 +375,18 @@ fn several_runs_do_not_disturb_each_other_nor_an_installed_agent() -> Result<()>
     let options = ["--settle", "2", "--page", "127.0.0.1:0"];
     let mut runs = Vec::new();
     for place in &places {
-        runs.push(place.start(&host, &options, &healthy(9)?)?);
+        let script = format!("echo began; {}", healthy_during("read line")?);
+        runs.push(place.start(&host, &options, &script)?);
+    }
+    for run in &mut runs {
+        run.wait_for("began", PATIENCE)?;
+    }
+    // The first two seconds are not judged.
+    let began = Instant::now();
+    wait_until_sent(&runs[0], 400)?;
+    std::thread::sleep(Duration::from_secs(4).saturating_sub(began.elapsed()));
+    for run in &mut runs {
+        run.write_line("end")?;
     }
     for (place, run) in places.iter().zip(&mut runs) {
         let failed = place.end(run, 0)?.failed();
@@ -502,13 +517,20 @@ fn agent_of(host: &Namespace) -> Result<String> {
     Ok(agent.context("no agent")?.to_string())
 }
 
+/// Waits until the host of a process has sent this many more datagrams.
+fn wait_until_sent(process: &Process, datagrams: u64) -> Result<()> {
+    let sent = || Snmp::of(process.pid())?.sent();
+    let before = sent()?;
+    wait_until("datagrams are sent", || Ok(sent()? >= before + datagrams))
+}
+
 #[test]
 fn packets_that_the_agent_dropped_are_a_warning_and_fail_a_strict_run() -> Result<()> {
     let host = Namespace::isolated()?;
     // This ring holds some 500 records, and the robot causes one for each message. For a bag, the
     // messages would be in the ring of packets, which holds more.
     let place = Place::new("capture: {source: wire, record_ring_bytes: 65536}\n")?;
-    let robot = healthy(12)?.replace("--rate 50", "--rate 500");
+    let robot = healthy_during("read line")?.replace("--rate 50", "--rate 500");
     let script = format!("echo began; {robot}");
     for (option, code, failed) in [
         (&[][..], 0, &[][..]),
@@ -521,12 +543,17 @@ fn packets_that_the_agent_dropped_are_a_warning_and_fail_a_strict_run() -> Resul
         let options = [&["--settle", "2", "--max-lost", "any", "--no-bag"], option].concat();
         let mut process = place.start(&host, &options, &script)?;
         process.wait_for("began", PATIENCE)?;
-        std::thread::sleep(Duration::from_secs(4));
+        let began = Instant::now();
+        wait_until_sent(&process, 1500)?;
+        // The first two seconds are not judged.
+        std::thread::sleep(Duration::from_secs(3).saturating_sub(began.elapsed()));
         // A stopped agent reads no record.
         let agent = agent_of(&host)?;
         harness::run(&format!("kill -STOP {agent}"))?;
-        std::thread::sleep(Duration::from_secs(3));
+        wait_until_sent(&process, 1500)?;
         harness::run(&format!("kill -CONT {agent}"))?;
+        wait_until_sent(&process, 500)?;
+        process.write_line("end")?;
         let cases = place.end(&mut process, code)?;
         assert_eq!(cases.failed(), failed);
         let printed = fs::read_to_string(place.path("said"))?;
@@ -580,9 +607,10 @@ fn topics_beyond_a_limit_fail_a_strict_run() -> Result<()> {
 fn an_agent_that_is_killed_fails_the_run_but_not_the_command() -> Result<()> {
     let host = Namespace::isolated()?;
     let place = Place::new(&at_the_sockets_of(&host))?;
-    let mut process = place.start(&host, &["--settle", "0"], "echo began; sleep 5; exit 0")?;
+    let mut process = place.start(&host, &["--settle", "0"], "echo began; read line; exit 0")?;
     process.wait_for("began", PATIENCE)?;
     harness::run(&format!("kill -KILL {}", agent_of(&host)?))?;
+    process.write_line("end")?;
     let failed = place.end(&mut process, CONDITION_FAILED)?.failed();
     ensure!(
         failed.contains(&"observation agent".to_owned()),

@@ -101,10 +101,12 @@ fn is_within_bounds(
     let mut seen = 0;
     loop {
         std::thread::sleep(Duration::from_millis(500));
+        let asked = SystemTime::now();
         if let Some((offset, uncertainty)) = corrections(&agent)? {
             let truth = clock.ahead_seconds + clock.drift * began.elapsed()?.as_secs_f64();
             let error = (offset - truth).abs();
-            let drifted = clock.drift * 2.0;
+            // The page is at most two seconds older than its request.
+            let drifted = clock.drift * (2.0 + asked.elapsed()?.as_secs_f64());
             ensure!(
                 error <= uncertainty + RESOLUTION + drifted,
                 "{offset} s is not {truth} s +- {uncertainty} s"

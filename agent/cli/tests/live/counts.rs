@@ -14,6 +14,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, bail, ensure};
 use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE, Scrape};
+use ros2probe_testing::harness::bpf::wait_metered;
 use ros2probe_testing::harness::capture::{self, Capture};
 use ros2probe_testing::harness::dissection::{Dissection, Samples};
 use ros2probe_testing::harness::event_log::EventLog;
@@ -281,7 +282,11 @@ impl Exchange {
         };
         // Until the agent has classified both endpoints, it reads no ACKNACKs, and samples that are
         // repaired immediately count as reordered.
-        std::thread::sleep(Duration::from_millis(500));
+        for observer in [&robot, &monitor] {
+            for endpoint in [publisher.guid()?, subscriber.guid()?] {
+                wait_metered(observer.agent.process.pid(), endpoint)?;
+            }
+        }
         publisher.start_sending()?;
         publisher
             .wait_sent(Duration::from_secs(60))

@@ -19,7 +19,7 @@ use serde_yaml::Value;
 const NO_CAPABILITIES: &str = "0000000000000000";
 const OUTAGE: Duration = Duration::from_secs(8);
 /// Maximum gap between samples of a scrape per second, in seconds, on a busy machine.
-const GAP: f64 = 6.0;
+const GAP: f64 = 7.5;
 
 /// The runtime's seccomp filter and its own setup of the confinement are not covered.
 #[test]

@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context as _, Result, anyhow, ensure};
 use clock::ClockStep;
 use ros2probe_testing::forged::crowd::{Crowd, Graph, Scale, Tally};
-use ros2probe_testing::forged::{Carrier, Sender, Talker, introduce, send_sizes};
+use ros2probe_testing::forged::{Carrier, Renewal, Sender, Talker, introduce, send_sizes};
 use ros2probe_testing::harness;
 use ros2probe_testing::harness::agent::{
     Agent, METRICS, ON_THE_WIRE, Scrape, at_the_sockets_of, get,
@@ -184,24 +184,27 @@ fn an_agent_stopped_for_seconds_keeps_all_participants_and_counts_dropped_frames
         crowd.repeat()?;
         robot.agent.process.signal("CONT")?;
         let woke = Instant::now();
-        robot.wait_ready()?;
-        let ready = woke.elapsed();
+        let ready = crowd.idle_during(|| robot.wait_ready().map(|()| woke.elapsed()))?;
         crowd.idle(Duration::from_secs(1))?;
-        let page = robot
-            .agent
-            .scrape_until("a fresh page with what was dropped", |page| {
-                page.sum("ros2probe_snapshot_age_seconds", &[]) < 1.0 && dropped(page) > 0.0
-            })?;
+        let (page, expired_now, graph) = crowd.idle_during(|| {
+            let page = robot
+                .agent
+                .scrape_until("a fresh page with what was dropped", |page| {
+                    page.sum("ros2probe_snapshot_age_seconds", &[]) < 1.0 && dropped(page) > 0.0
+                })?;
+            Ok((
+                page,
+                robot.expired_participants()?,
+                graph_of(&link.monitor)?,
+            ))
+        })?;
         let missed = dropped(&page);
         ensure!(
-            robot.expired_participants()? == expired,
+            expired_now == expired,
             "somebody is believed gone: {}",
             page.0
         );
-        ensure!(
-            graph_of(&link.monitor)? == crowd.graph(),
-            "the graph is another one"
-        );
+        ensure!(graph == crowd.graph(), "the graph is another one");
         let text = format!(
             "nobody believed gone, {missed} frames dropped and counted, ready after {ready:?}"
         );
@@ -225,6 +228,8 @@ fn an_overloaded_agent_counts_dropped_records_and_is_exact_afterwards() -> Resul
     let mut sender = robot.sender()?;
     introduce(&real, &mut sender)?;
     introduce(&flood, &mut sender)?;
+    let _real_lease = Renewal::start(robot.sender()?, real.participant());
+    let _flood_lease = Renewal::start(robot.sender()?, flood.participant());
     send_sizes(&mut real, &mut sender, [320; 100])?;
     robot.agent.settled_scrape("/real", 100)?;
     // The agent gets 2 ms of CPU in 100 ms, which is less than it needs.
@@ -232,9 +237,6 @@ fn an_overloaded_agent_counts_dropped_records_and_is_exact_afterwards() -> Resul
     let began = Instant::now();
     let span = Duration::from_secs(soak::long().map_or(3, |_| 30));
     while began.elapsed() < span {
-        // The leases of both are shorter than a long flood.
-        sender.send(&real.participant())?;
-        sender.send(&flood.participant())?;
         for _ in 0..200 {
             sender.send(&flood.sample(1200))?;
         }
@@ -495,7 +497,7 @@ impl<'a> Robot<'a> {
             .sum("ros2_discovery_events_total", &labels))
     }
 
-    /// Returns the status of `/readyz`, or 000 without an answer within three seconds.
+    /// Returns the status of `/readyz`, or 000 without an answer within thirty seconds.
     fn readiness(&self) -> Result<String> {
         let [enter, network] = self.link.monitor.outside();
         let output = Command::new(enter)
@@ -504,7 +506,7 @@ impl<'a> Robot<'a> {
                 "curl",
                 "-s",
                 "-m",
-                "3",
+                "30",
                 "-o",
                 "/dev/null",
                 "-w",

@@ -1,12 +1,11 @@
 //! A leaving publisher announces its end within milliseconds after its last sample. Announcements
 //! in a frame do not overtake samples, so the last samples count.
 
-use std::time::Duration;
-
 use anyhow::{Context as _, Result};
 use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE};
 use ros2probe_testing::harness::network::Link;
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
+use ros2probe_testing::harness::wait_until;
 
 #[test]
 fn the_last_samples_before_a_goodbye_are_counted() -> Result<()> {
@@ -23,10 +22,11 @@ fn the_last_samples_before_a_goodbye_are_counted() -> Result<()> {
     let mut publisher = Peer::start(host, Stack::Cyclone, role, &stream, &["/imu_driver"])?;
     publisher.wait_matched()?;
     publisher.start_sending()?;
-    std::thread::sleep(Duration::from_secs(1));
+    wait_until("a hundred samples are sent", || {
+        Ok(publisher.log()?.sequences("pub").len() > 100)
+    })?;
     publisher.process.terminate()?;
     let sent = publisher.log()?.sequences("pub").len();
-    assert!(sent > 100, "{sent}");
     let counted = agent
         .settled_scrape("/imu", sent as u64)?
         .sum("ros2_topic_messages_total", &[("topic", "/imu")]);

@@ -23,12 +23,11 @@ use std::io::{Read, Write};
 use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
-use std::sync::mpsc::RecvTimeoutError;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, ensure};
 use ros2probe_capture::netns;
-use ros2probe_testing::forged::{Carrier as _, Sender, Talker, send_sizes};
+use ros2probe_testing::forged::{Carrier as _, Renewal, Sender, Talker, send_sizes};
 use ros2probe_testing::harness;
 use ros2probe_testing::harness::agent::{Agent, Scrape};
 use ros2probe_testing::harness::network::{Link, Namespace};
@@ -39,11 +38,9 @@ use tempfile::TempDir;
 const METRICS_PORT: u16 = 17400;
 const API_PORT: u16 = 17401;
 const PATIENCE: Duration = Duration::from_secs(60);
-/// Interval of announcements, as of real participants.
-const REPEAT: Duration = Duration::from_secs(3);
-/// Maximum duration of a shutdown: 3 s for answers and the last round, 2 s for the last export, 3 s
-/// for a busy machine.
-const ENDING: Duration = Duration::from_secs(8);
+/// Maximum duration of a shutdown: 3 s for answers and the last round, 2 s for the last export, and
+/// the rest for a busy machine.
+const ENDING: Duration = Duration::from_secs(30);
 
 /// An agent on a separate host, with a directory for its files.
 struct FaultBench<'a> {
@@ -146,8 +143,7 @@ struct Counted {
     sender: Sender,
     topic: String,
     sent: u64,
-    /// Ends the announcements when it is dropped.
-    _stop: std::sync::mpsc::Sender<()>,
+    _renewal: Renewal,
 }
 
 impl Counted {
@@ -158,20 +154,14 @@ impl Counted {
         for message in talker.introduction(node) {
             sender.send(&message)?;
         }
-        let mut repeater = Sender::between(&link.monitor, &link.robot)?;
-        let announcement = talker.participant();
-        let (stop, stopped) = std::sync::mpsc::channel();
-        std::thread::spawn(move || {
-            while stopped.recv_timeout(REPEAT) == Err(RecvTimeoutError::Timeout) {
-                let _ = repeater.send(&announcement);
-            }
-        });
+        let repeater = Sender::between(&link.monitor, &link.robot)?;
+        let renewal = Renewal::start(repeater, talker.participant());
         Ok(Counted {
             talker,
             sender,
             topic,
             sent: 0,
-            _stop: stop,
+            _renewal: renewal,
         })
     }
 

@@ -16,10 +16,14 @@ fn the_history_has_every_message_before_the_end_of_the_agent() -> Result<()> {
     let scene = Scene::new()?;
     let mut agent = scene.agent()?;
     let robot = Robot::start(&scene.place.host)?;
-    std::thread::sleep(Duration::from_secs(8));
+    harness::wait_until("messages are measured", || {
+        let imu = scene.place.ask("/topics/imu").unwrap_or_default();
+        Ok(imu["measurement"]["messages"].as_u64() > Some(300))
+    })?;
     drop(robot);
     // The last messages are in a finished second.
-    std::thread::sleep(Duration::from_secs(3));
+    agent.settled_scrape("/imu", 0)?;
+    std::thread::sleep(Duration::from_millis(1500));
     let counted = &scene.place.ask("/topics/imu")?["measurement"]["messages"];
     let counted = counted.as_u64().context("no count")?;
     ensure!(counted > 100, "{counted}");
@@ -75,7 +79,7 @@ fn a_killed_agent_loses_at_most_the_last_minute() -> Result<()> {
     let _agent = scene.agent()?;
     let kept = scene.messages(&path)?;
     ensure!(
-        kept > 5000 && kept <= written,
+        kept * 2 > written && kept <= written,
         "{kept} of {written}: {}",
         scene.place.ask(&path)?
     );

@@ -8,8 +8,9 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, bail, ensure};
-use ros2probe_testing::forged::{Sender, Talker, introduce, send_sizes};
+use ros2probe_testing::forged::{Renewal, Sender, Talker, introduce, send_sizes};
 use ros2probe_testing::harness::agent::{Agent, Scrape, at_the_sockets_of};
+use ros2probe_testing::harness::bpf::wait_metered;
 use ros2probe_testing::harness::cgroup;
 use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::peer::{Stack, Stream, pair, robot};
@@ -193,6 +194,8 @@ fn a_mirrored_interface_shows_forwarded_messages_once() -> Result<()> {
     let mut sender = Sender::between(&link.robot, &link.monitor)?;
     let mut talker = Talker::new(1, "/forwarded");
     introduce(&talker, &mut sender)?;
+    let repeater = Sender::between(&link.robot, &link.monitor)?;
+    let _renewal = Renewal::start(repeater, talker.participant());
     send_sizes(&mut talker, &mut sender, [320; 200])?;
     let stream = Stream {
         topic: "/received".to_owned(),
@@ -289,6 +292,7 @@ fn three_capabilities_suffice_at_the_sockets_and_all_are_dropped_later() -> Resu
     assert!(status.contains("\nCapPrm:\t0000000000000000\n"), "{status}");
     let stream = Stream::small(600);
     let (mut publisher, _subscriber) = pair(&link.robot, &link.monitor, Stack::Cyclone, &stream)?;
+    wait_metered(observed.agent.process.pid(), publisher.guid()?)?;
     publisher.start_sending()?;
     publisher.wait_sent(PATIENCE)?;
     let page = observed.wait(|page| wait_removed(page, &stream.topic))?;

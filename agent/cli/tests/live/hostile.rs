@@ -10,13 +10,18 @@ use std::time::{Duration, Instant};
 use anyhow::{Context as _, Result};
 use ros2probe_testing::forged::frames::Wire;
 use ros2probe_testing::forged::storm::{Dice, Storm, forgery};
-use ros2probe_testing::forged::{self, Carrier, Sender, Talker, introduce, send_sizes};
+use ros2probe_testing::forged::{
+    self, Carrier, Pace, SAMPLES_WRITER, Sender, Talker, introduce, send_sizes,
+};
 use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE, Scrape, at_the_sockets_of};
+use ros2probe_testing::harness::bpf::wait_metered;
 use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
 use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::usage::Usage;
+use ros2probe_testing::harness::wait_until;
 use ros2probe_testing::local_agent;
+use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 use tempfile::TempDir;
 
 /// A port without a socket on the robot: only the agent observes the storm.
@@ -43,7 +48,9 @@ print("ready", flush=True)
 sys.stdin.read()
 "#;
 /// Maximum time of recovery. Cyclone DDS repeats its announcement every 8 s.
-const RECOVERY: Duration = Duration::from_secs(30);
+const RECOVERY: Duration = Duration::from_secs(60);
+/// Maximum wait on a busy machine.
+const PATIENCE: Duration = Duration::from_secs(60);
 
 #[test]
 fn a_storm_of_forged_rtps_leaves_memory_bounded_and_a_real_topic_exact() -> Result<()> {
@@ -132,6 +139,8 @@ fn three_capabilities_suffice_for_an_unprivileged_user() -> Result<()> {
     let mut sender = Sender::between(&link.robot, &link.monitor)?;
     let mut talker = Talker::new(1, "/unprivileged");
     introduce(&talker, &mut sender)?;
+    let writer = Guid::new(GuidPrefix(talker.prefix), EntityId(SAMPLES_WRITER));
+    wait_metered(agent.process.pid(), writer)?;
     send_sizes(&mut talker, &mut sender, [320; 500])?;
     let page = agent.settled_scrape("/unprivileged", 500)?;
     let counted = page.sum("ros2_topic_messages_total", &[("topic", "/unprivileged")]);
@@ -164,16 +173,13 @@ fn hanging_shared_memory_is_reported_and_delays_no_other_part() -> Result<()> {
     let script = STUCK_MOUNT.replace("USER", &STUCK.to_string());
     let hold = || -> Result<Process> {
         let mut holder = Process::start(&enter, "python3", ["-c", &script])?;
-        holder.wait_for("ready", Duration::from_secs(10))?;
+        holder.wait_for("ready", PATIENCE)?;
         Ok(holder)
     };
     let holder = hold()?;
     let came = Instant::now();
-    agent.scrape_until("shared memory is not seen", |page| !is_able(page))?;
+    wait_hanging(&agent)?;
     eprintln!("it is noticed after {:?}", came.elapsed());
-    let reason = agent.request("/readyz").unwrap_err().to_string();
-    let printed = "capture.shm: its thread has made no progress for ";
-    assert!(reason.contains(printed), "{reason}");
 
     // Everything else continues.
     let mut sender = Sender::between(&link.monitor, &link.robot)?;
@@ -187,15 +193,31 @@ fn hanging_shared_memory_is_reported_and_delays_no_other_part() -> Result<()> {
     // The kernel ends the wait with the file system.
     drop(holder);
     agent.scrape_until("shared memory is seen again", is_able)?;
-    agent.wait_ready(Duration::from_secs(10))?;
+    agent.wait_ready(PATIENCE)?;
     let _holder = hold()?;
-    agent.scrape_until("shared memory is not seen", |page| !is_able(page))?;
+    wait_hanging(&agent)?;
     agent.process.signal("TERM")?;
     let began = Instant::now();
-    let status = agent.process.wait(Duration::from_secs(8))?;
+    let status = agent.process.wait(Duration::from_secs(30))?;
     assert!(status.success(), "{status}");
     eprintln!("it ends within {:?}", began.elapsed());
     Ok(())
+}
+
+/// Waits until the agent reports that the thread of shared memory hangs. A thread without CPU time
+/// may be missed for a moment before.
+fn wait_hanging(agent: &Agent<'_>) -> Result<()> {
+    let printed = "capture.shm: its thread has made no progress for ";
+    wait_until("the hanging thread is reported", || {
+        let reason = agent
+            .request("/readyz")
+            .err()
+            .map(|error| error.to_string());
+        let is_able = agent
+            .scrape()?
+            .sum("ros2probe_capture_ability", &[("ability", "shared_memory")]);
+        Ok(is_able == 0.0 && reason.is_some_and(|reason| reason.contains(printed)))
+    })
 }
 
 /// Writes a program that starts `rp` as a user and group with these capabilities alone. The user
@@ -230,11 +252,12 @@ fn with_participant_flood(capture: impl Fn(&Link) -> String) -> Result<()> {
     let _receiver = link.robot.hold(|| Sender::new(&link.robot, &to, &to))?;
     let from = format!("{}:0", link.monitor.address());
     let sender = Sender::new(&link.monitor, &from, &to)?;
-    let flood = Storm::of_a_crowd(Paced(sender), 1500, 4);
-    std::thread::sleep(Duration::from_secs(6));
+    let pace = Pace::new(Duration::from_micros(500));
+    let flood = Storm::of_a_crowd(Paced { sender, pace }, 1500, 4);
     let full = [("limit", "participants")];
-    let page = agent.scrape()?;
-    assert_eq!(page.sum("ros2probe_at_limit", &full), 1.0, "{}", page.0);
+    agent.scrape_until("the table is full", |page| {
+        page.sum("ros2probe_at_limit", &full) == 1.0
+    })?;
 
     let stream = Stream {
         topic: "/real".to_owned(),
@@ -258,9 +281,11 @@ fn with_participant_flood(capture: impl Fn(&Link) -> String) -> Result<()> {
     assert_eq!(counted, stream.count as f64, "{}", agent.scrape()?.0);
     assert_eq!(page.sum("ros2_topic_lost_messages_total", &real), 0.0);
 
-    let readiness = agent.request("/readyz")?;
     let printed = "ready\ndegraded: at a limit: participants (1000 of 1000, ";
-    assert!(readiness.starts_with(printed), "{readiness}");
+    wait_until("the limit is in the readiness", || {
+        let readiness = agent.request("/readyz");
+        Ok(readiness.is_ok_and(|text| text.starts_with(printed)))
+    })?;
     let [program, arguments @ ..] = &link.robot.outside();
     let doctor = Command::new(program)
         .args(arguments)
@@ -275,12 +300,15 @@ fn with_participant_flood(capture: impl Fn(&Link) -> String) -> Result<()> {
 }
 
 /// A sender of some 2000 datagrams per second.
-struct Paced(Sender);
+struct Paced {
+    sender: Sender,
+    pace: Pace,
+}
 
 impl Carrier for Paced {
     fn send(&mut self, payload: &[u8]) -> Result<()> {
-        std::thread::sleep(Duration::from_micros(400));
-        self.0.send(payload)
+        self.pace.wait();
+        self.sender.send(payload)
     }
 }
 
@@ -379,9 +407,9 @@ fn check_new_participants(agent: &Agent<'_>, link: &Link) -> Result<()> {
         topic: "/after".to_owned(),
         ..Stream::small(200)
     };
-    let came = Instant::now();
     let both = ["/late_listener", "/late_driver"];
     let [_subscriber, mut publisher] = matched_pair(link, &stream, both)?;
+    let came = Instant::now();
     loop {
         let page = agent.scrape()?;
         let nodes = page.labels_of("ros2_node_info", "ros_node");

@@ -10,10 +10,16 @@ use ros2probe_testing::harness;
 use ros2probe_testing::harness::agent::{Agent, at_the_sockets_of};
 use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
-use ros2probe_testing::harness::wait_until;
+use ros2probe_testing::harness::{wait_until, wait_within};
 
 /// Time to learn: more than the 20 s with a publisher that the numbers of endpoints need.
 const LEARNS: Duration = Duration::from_secs(30);
+/// Time for which the agent does not judge a new watch.
+const GRACE: Duration = Duration::from_secs(10);
+/// Time without a violation that shows a healthy robot.
+const HEALTHY_TIME: Duration = Duration::from_secs(5);
+/// Maximum time until then: the robot itself is late on a busy machine.
+const HEALTHY_WITHIN: Duration = Duration::from_secs(150);
 const VIOLATED: &str = "ros2_watch_expectation_violated";
 
 /// An agent that watches nothing by itself, and its files.
@@ -77,10 +83,7 @@ fn expectations_of_a_live_robot_are_learnt_without_a_watch_and_detect_its_faults
     let host = Namespace::isolated()?;
     let directory = tempfile::tempdir()?;
     let place = Place::new(&host, directory.path())?;
-    let imu = Stream {
-        depth: 10,
-        ..Stream::small(1_000_000)
-    };
+    let imu = Stream::small(1_000_000);
     let scan = Stream {
         topic: "/scan".to_owned(),
         rate: 20.0,
@@ -128,12 +131,13 @@ fn expectations_of_a_live_robot_are_learnt_without_a_watch_and_detect_its_faults
     wait_until("the watchlist applies", || {
         Ok(place.violates("/scan", "subscribers")?.is_some())
     })?;
-    std::thread::sleep(Duration::from_secs(15));
-    let violated = place.agent.scrape()?.sum(VIOLATED, &[]);
-    ensure!(
-        violated == 0.0,
-        "{violated} expectations of a healthy robot"
-    );
+    let mut since = Instant::now() + GRACE;
+    wait_within(HEALTHY_WITHIN, "a healthy robot violates nothing", || {
+        if place.agent.scrape()?.sum(VIOLATED, &[]) > 0.0 {
+            since = Instant::now();
+        }
+        Ok(since.elapsed() >= HEALTHY_TIME)
+    })?;
 
     drop(driver);
     let half = Stream {
@@ -150,8 +154,9 @@ fn expectations_of_a_live_robot_are_learnt_without_a_watch_and_detect_its_faults
             Ok(place.violates(topic, expectation)? == Some(true))
         })?;
     }
-    ensure!(place.violates("/scan", "max_silence_s")? == Some(false));
-    Ok(())
+    wait_until("/scan is not silent", || {
+        Ok(place.violates("/scan", "max_silence_s")? == Some(false))
+    })
 }
 
 /// Checks that the file is valid and that each topic has a rate, a loss, a silence and endpoints.

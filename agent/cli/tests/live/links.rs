@@ -52,6 +52,8 @@ fn cyclone_dds_over_ipv6_is_counted_as_over_ipv4() -> Result<()> {
     let ipv6 = "CYCLONEDDS_URI=<General><Transport>udp6</Transport></General>";
     let stream = Stream {
         rate: 50.0,
+        // Both nodes stay until they have been seen.
+        linger: 120.0,
         ..Stream::point_cloud(16_000, 100)
     };
     let on_ipv6 =
@@ -144,12 +146,13 @@ fn a_new_interface_is_seen_and_one_set_down_causes_no_busy_loop() -> Result<()> 
 
     ip(&link.monitor, "link set eth1 down")?;
     let pid = observed.agent.process.pid();
-    let before = Usage::of(pid)?;
+    let (before, began) = (Usage::of(pid)?, Instant::now());
     std::thread::sleep(Duration::from_secs(3));
     let spent = Usage::of(pid)?.since(&before).cpu;
+    let elapsed = began.elapsed();
     assert!(
-        spent < Duration::from_millis(300),
-        "{spent:?} in 3 s with a link down"
+        spent < elapsed / 10,
+        "{spent:?} in {elapsed:?} with a link down"
     );
 
     ip(&link.monitor, "link set eth1 up")?;

@@ -7,6 +7,7 @@ use anyhow::Result;
 use ros2probe_testing::harness::loss::Loss;
 use ros2probe_testing::harness::network::Link;
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
+use ros2probe_testing::harness::wait_until;
 
 const SAMPLES: u64 = 600;
 
@@ -86,7 +87,11 @@ impl Exchange {
         let loss = Loss::of_samples(&link.robot, &link.monitor, &stream, per_mille)?;
         publisher.start_sending()?;
         publisher.wait_sent(Duration::from_secs(60))?;
-        std::thread::sleep(Duration::from_millis(300));
+        // A busy RustDDS writer sends later, and a busy subscriber logs later.
+        wait_until("each sample is received or dropped", || {
+            let received = subscriber.log()?.sequences("sub").len() as u64;
+            Ok(received + loss.counts()?.dropped >= SAMPLES)
+        })?;
         let counts = loss.counts()?;
         // A busy RustDDS writer packs several samples into a datagram, which is never dropped.
         assert!(

@@ -78,9 +78,13 @@ fn three_capabilities_suffice_at_the_sockets() -> Result<()> {
     );
     let processes = page.labels_of("ros2_subscriber_info", "process");
     assert!(processes.contains("cyclonedds"), "{processes:?}");
-    let writes = |outcome| page.value("ros2probe_state_writes_total", &[("outcome", outcome)]);
-    assert!(writes("written").is_some_and(|count| count > 0.0));
-    assert_eq!(writes("failed"), Some(0.0));
+    let writes = |page: &Scrape, outcome| {
+        page.value("ros2probe_state_writes_total", &[("outcome", outcome)])
+    };
+    let page = agent.scrape_until("a written state", |page| {
+        writes(page, "written").is_some_and(|count| count > 0.0)
+    })?;
+    assert_eq!(writes(&page, "failed"), Some(0.0));
     Ok(())
 }
 

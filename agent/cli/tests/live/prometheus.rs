@@ -15,7 +15,7 @@ use ros2probe_testing::harness::prometheus::{INSTALL, Prometheus};
 
 /// Window of the rates.
 const WINDOW: Duration = Duration::from_secs(6);
-const PATIENCE: Duration = Duration::from_secs(40);
+const PATIENCE: Duration = Duration::from_secs(80);
 
 #[test]
 fn prometheus_returns_the_rates_at_which_the_demo_robot_publishes() -> Result<()> {

@@ -237,8 +237,8 @@ fn a_recording_is_controlled_by_its_client_and_outlives_it() -> Result<()> {
     let mut client = Recorder::start(&robot, "killed", &["/imu"])?;
     let killed = robot.directory.path().join("killed");
     wait_until("it is in the file", || Ok(bytes(&killed) > 200_000))?;
-    client.process.signal("KILL")?;
     let end = now();
+    client.process.signal("KILL")?;
     client.process.wait(PATIENCE)?;
     repaired(&killed, &imu, end)?;
 
@@ -249,8 +249,8 @@ fn a_recording_is_controlled_by_its_client_and_outlives_it() -> Result<()> {
     robot.ask("POST", "/recordings", &wanted)?;
     let last = robot.bags().join("last");
     wait_until("it is in the file", || Ok(bytes(&last) > 200_000))?;
-    robot.agent.process.signal("KILL")?;
     let end = now();
+    robot.agent.process.signal("KILL")?;
     robot.agent.process.wait(PATIENCE)?;
     repaired(&last, &imu, end)
 }

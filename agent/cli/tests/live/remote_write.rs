@@ -12,6 +12,9 @@ use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::prometheus::{Kind, Prometheus};
 use ros2probe_testing::harness::wait_within;
+use serde_json::json;
+
+use crate::browser::player::play;
 
 /// Maximum gap between samples of each second, in seconds, on a busy machine.
 const GAP: f64 = 6.0;
@@ -105,7 +108,22 @@ fn rp_fleet_finds_the_differing_robots_among_ten() -> Result<()> {
             .is_some_and(|all| !all.is_empty());
         ensure!(odd == (robot["name"] == "robot-7"), "{robot}");
     }
+    let (code, text) = fleet(&["robot-7"])?;
+    ensure!(code == Some(0), "{text}");
+    let (nodes, rest) = text.split_once("\nnodes\n").context("no nodes")?;
+    ensure!(
+        nodes.contains("robot-7  ") && !nodes.contains("robot-1 "),
+        "{text}"
+    );
+    ensure!(rest.contains(" is missing (8 of 9)"), "{text}");
+    ensure!(rest.contains("\npublishers and subscriptions\n"), "{text}");
+    let (code, text) = fleet(&["robot-11"])?;
+    ensure!(
+        code == Some(1) && text.contains("has no robot `robot-11`"),
+        "{text}"
+    );
     the_page_has_the_robots(&centre)?;
+    an_agent_answers_with_the_robots(&centre, directory.path())?;
     let (code, text) = fleet(&["--job", "other"])?;
     ensure!(
         code == Some(1) && text.contains("has no robots of the job `other`"),
@@ -141,6 +159,77 @@ fn the_page_has_the_robots(centre: &Namespace) -> Result<()> {
         ensure!(page.contains(part), "{part}: {page}");
     }
     server.terminate()?;
+    Ok(())
+}
+
+/// Puts a bag of a robot into a folder, as `rp ship` delivers it.
+fn deliver_an_incident(store: &Path) -> Result<()> {
+    let manifest = json!({
+        "version": 1, "robot": "robot-7", "bag": "incident_1", "is_complete": true,
+        "trigger": {
+            "snapshot": "incident", "trigger": "message_lost", "event": "ros2.message.lost",
+            "time": "2026-11-20T02:34:07Z", "attributes": {"topic": "/scan"},
+        },
+        "findings": [{"name": "ros2.message.lost"}, {"name": "ros2.message.lost"}],
+        "start": "2026-11-20T02:34:00Z", "end": "2026-11-20T02:34:07.5Z",
+        "messages": 75, "topics": [],
+        "files": [{"name": "incident_1_0.mcap", "bytes": 3 << 20, "sha256": ""}],
+        "program": "ros2probe",
+    });
+    let bag = store.join("robot-7/incident_1");
+    std::fs::create_dir_all(&bag)?;
+    std::fs::write(bag.join("manifest.json"), manifest.to_string())?;
+    Ok(())
+}
+
+/// Checks that an agent whose configuration has the engine answers with the same robots.
+fn an_agent_answers_with_the_robots(centre: &Namespace, directory: &Path) -> Result<()> {
+    let (configuration, store) = (directory.join("centre.yaml"), directory.join("store"));
+    deliver_an_incident(&store)?;
+    let text = format!(
+        "fleet: {{engine: 'http://127.0.0.1:9090', reach_s: 10, \
+         link: 'http://{{robot}}.example:17401/', store: {{url: 'file://{}'}}}}\n",
+        store.display()
+    );
+    std::fs::write(&configuration, text)?;
+    let capture = "wire/tests/data/cyclonedds-samehost-any.pcap.gz";
+    let arguments = ["run", "--foxglove", "off", "--api", "127.0.0.1:17402"]
+        .into_iter()
+        .chain(["--metrics", "off", "--config"])
+        .map(OsString::from)
+        .chain([configuration.into(), "--replay".into()])
+        .chain([ros2probe_testing::repository(capture).into()]);
+    let mut agent = Process::start(&centre.outside(), env!("CARGO_BIN_EXE_rp"), arguments)?;
+    let mut answer = serde_json::Value::Null;
+    wait_within(Duration::from_secs(40), "ten robots of the API", || {
+        let text = get(centre, "http://127.0.0.1:17402/fleet").unwrap_or_default();
+        answer = serde_json::from_str(&text).unwrap_or_default();
+        Ok(answer["robots"]
+            .as_array()
+            .is_some_and(|all| all.len() == 10))
+    })?;
+    let robots = answer["robots"].as_array().context("no robots")?;
+    ensure!(
+        robots[0]["name"] == "robot-3" && robots[0]["state"] == "out_of_reach",
+        "{answer}"
+    );
+    let odd = robots.iter().find(|robot| robot["name"] == "robot-7");
+    let odd = odd.context("no robot-7")?;
+    ensure!(odd["page"] == "http://robot-7.example:17401/", "{odd}");
+    let differences = odd["differences"].as_array().context("no differences")?;
+    let missing = differences.iter().find(|each| each["part"] == "nodes");
+    let missing = missing.context("no node")?["text"]
+        .as_str()
+        .unwrap_or_default();
+    ensure!(missing.contains(" (8 of 9)"), "{odd}");
+    ensure!(
+        answer["at"].is_number() && answer["problem"].is_null(),
+        "{answer}"
+    );
+    let mut nothing = |question: &str| anyhow::bail!("no answer to {question}");
+    let page = "http://127.0.0.1:17402/";
+    play(&centre.outside(), "fleet", &[page], &mut nothing)?;
+    agent.terminate()?;
     Ok(())
 }
 

@@ -14,7 +14,7 @@ use ros2probe_testing::robot_log::{DDS_TYPE, log};
 
 use crate::robot_parts::Node;
 
-const PATIENCE: Duration = Duration::from_secs(30);
+const PATIENCE: Duration = Duration::from_secs(60);
 
 /// Starts a node on another host that logs.
 fn start(link: &Link) -> Result<Node> {

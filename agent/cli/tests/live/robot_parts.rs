@@ -5,23 +5,25 @@ use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use anyhow::Result;
-use ros2probe_testing::forged::{Carrier as _, SAMPLES_WRITER, Sender, Talker};
+use ros2probe_testing::forged::{Carrier as _, Renewal, SAMPLES_WRITER, Sender, Talker};
 use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE, Scrape, get};
 use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::process::Process;
+use ros2probe_testing::harness::wait_until;
 use ros2probe_testing::robot_diagnostics::{self, Status, diagnostics};
 use ros2probe_testing::robot_parameters::{self, boolean, event, request};
 use ros2probe_testing::robot_states::{self, battery, transition, with_header};
 use ros2probe_testing::robot_transforms::{self, Transform, transforms};
 
-const PATIENCE: Duration = Duration::from_secs(30);
+const PATIENCE: Duration = Duration::from_secs(60);
 const RP: &str = env!("CARGO_BIN_EXE_rp");
 
-/// A node on another host with one writer.
+/// A node on another host with one writer. It renews its lease until it is dropped.
 pub(crate) struct Node {
     talker: Talker,
     sender: Sender,
     number: u32,
+    _renewal: Renewal,
 }
 
 impl Node {
@@ -31,10 +33,13 @@ impl Node {
         sender.send(&talker.participant())?;
         sender.send(&talker.publication(SAMPLES_WRITER, topic.0, topic.1, 1))?;
         sender.send(&talker.entities(name))?;
+        let repeater = Sender::between(&link.robot, &link.monitor)?;
+        let renewal = Renewal::start(repeater, talker.participant());
         Ok(Self {
             talker,
             sender,
             number: 0,
+            _renewal: renewal,
         })
     }
 
@@ -131,17 +136,16 @@ fn diagnostics_have_levels_values_findings_and_a_command_without_a_watch() -> Re
     node.say(2, "no data")?;
     following.wait_for("ERROR  lidar: connection: no data", PATIENCE)?;
     // A part that ceases to publish would be stale after 5 s.
-    for _ in 0..14 {
-        std::thread::sleep(Duration::from_millis(500));
+    wait_until("the finding", || {
         node.say(2, "no data")?;
-    }
-    agent.scrape_until("the finding", |page| {
-        page.sum("ros2_diagnoses", &[("kind", "diagnostic_error")]) == 1.0
+        let page = agent.scrape()?;
+        Ok(page.sum("ros2_diagnoses", &[("kind", "diagnostic_error")]) == 1.0)
     })?;
     assert_eq!(
         rp(&link.monitor, &["diag", "-l", "error"])?,
         "ERROR  lidar: connection: no data\n"
     );
+    node.say(2, "no data")?;
     let verbose = rp(&link.monitor, &["diag", "-v", "lidar"])?;
     assert!(
         verbose.contains("hardware hw, /diagnostics of /driver, "),
@@ -339,8 +343,9 @@ fn misspelt_names_and_frames_without_transforms_are_reported() -> Result<()> {
     sender.send(&viewer.subscription([0, 0, 3, 4], "rt/camera/imgae", image, 1))?;
     sender.send(&viewer.entities("viewer"))?;
     agent.scrape_until("the nodes", |page| page.sum("ros2_nodes", &[]) == 3.0)?;
-    // Messages renew the leases, which are short.
-    for step in 0..26 {
+    let _renewal = Renewal::start(sender, viewer.participant());
+    let (mut step, mut near_miss, mut frame) = (0, false, false);
+    wait_until("the near miss and the frame", || {
         camera.send(&with_header("camera_optical", 1000))?;
         ekf.send(&transforms(&[Transform {
             parent: "odom",
@@ -349,16 +354,13 @@ fn misspelt_names_and_frames_without_transforms_are_reported() -> Result<()> {
             x: 0.0,
             yaw: 0.0,
         }]))?;
-        sender.send(&viewer.participant())?;
-        std::thread::sleep(Duration::from_millis(500));
-    }
-    agent.scrape_until("the near miss", |page| {
-        page.sum("ros2_diagnoses", &[("kind", "near_miss")]) == 1.0
-    })?;
-    agent.scrape_until("the frame", |page| {
-        page.sum("ros2_diagnoses", &[("kind", "transform_fault")]) == 1.0
-    })?;
-    Ok(())
+        step += 1;
+        std::thread::sleep(Duration::from_millis(400));
+        let page = agent.scrape()?;
+        near_miss |= page.sum("ros2_diagnoses", &[("kind", "near_miss")]) == 1.0;
+        frame |= page.sum("ros2_diagnoses", &[("kind", "transform_fault")]) == 1.0;
+        Ok(near_miss && frame)
+    })
 }
 
 #[test]

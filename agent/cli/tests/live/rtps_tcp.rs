@@ -2,6 +2,8 @@
 
 use std::io::Write as _;
 use std::net::{Ipv4Addr, SocketAddrV4, TcpListener, TcpStream};
+use std::path::Path;
+use std::process::Stdio;
 use std::time::Duration;
 
 use crate::browser::PAGE;
@@ -13,6 +15,7 @@ use ros2probe_testing::harness::agent::{Agent, Scrape, at_the_sockets_of};
 use ros2probe_testing::harness::loss::Loss;
 use ros2probe_testing::harness::network::{INTERFACE, Link, Namespace};
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
+use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::snmp::Snmp;
 use ros2probe_testing::harness::{run, wait_until};
 use tempfile::TempDir;
@@ -117,6 +120,7 @@ fn counts_and_deliveries_on_one_host_equal_the_logs() -> Result<()> {
         publisher.start_sending()?;
         publisher.wait_sent(PATIENCE)?;
         let page = agent.settled_scrape(&stream.topic, stream.count)?;
+        subscriber.wait_received(stream.count)?;
         subscriber.process.terminate()?;
         let (sent, received) = logged(&publisher, &subscriber)?;
         assert_eq!((sent, received), (stream.count, stream.count));
@@ -147,6 +151,7 @@ fn counts_on_two_hosts_equal_the_logs_at_either_end() -> Result<()> {
             let agent = &observer.agent;
             agent.settled_scrape(&stream.topic, stream.count)
         });
+        subscriber.wait_received(stream.count)?;
         subscriber.process.terminate()?;
         let (sent, received) = logged(&publisher, &subscriber)?;
         assert_eq!((sent, received), (stream.count, stream.count));
@@ -191,6 +196,7 @@ fn segments_retransmitted_by_tcp_lose_no_message() -> Result<()> {
             let page = agent.settled_scrape(&stream.topic, stream.count)?;
             all_dropped += loss.counts()?.dropped;
             drop(loss);
+            subscriber.wait_settled(stream.count)?;
             subscriber.process.terminate()?;
             let (sent, received) = logged(&publisher, &subscriber)?;
             let counted = ["messages", "delivered_messages", "lost_messages"];
@@ -229,6 +235,7 @@ fn samples_that_the_sender_drops_are_lost_at_the_sender() -> Result<()> {
     publisher.start_sending()?;
     publisher.wait_sent(PATIENCE)?;
     let page = agent.settled_scrape(&stream.topic, 1)?;
+    subscriber.wait_settled(count(&page, "delivered_messages", &stream.topic))?;
     let log = subscriber.log()?;
     let (received, missing) = (log.sequences("sub").len() as u64, log.missing());
     ensure!(missing > 50, "only {missing} are missing");
@@ -282,6 +289,8 @@ fn retransmitted_segments_of_a_link_equal_those_of_the_kernel_and_are_a_finding(
     let page = agent.scrape_until("the finding", |page| {
         page.sum("ros2_diagnoses", &[("kind", "lossy_link")]) == 1.0
     })?;
+    let unsent = page.value("ros2_link_unsent_bytes", &labels);
+    assert!(unsent.is_some(), "{}", page.0);
     let round_trip = page.value("ros2_link_round_trip_seconds", &labels);
     ensure!(
         round_trip.is_some_and(|time| time > 0.0 && time < 1.0),
@@ -317,6 +326,96 @@ fn counts_on_an_interface_equal_the_logs() -> Result<()> {
     let (sent, _) = logged(&publisher, &subscriber)?;
     let counted = ["messages", "lost_messages"].map(|what| count(&page, what, &small.topic));
     assert_eq!(counted, [sent, 0]);
+    Ok(())
+}
+
+/// Returns the locator of a participant that accepts TCP connections at the loopback address.
+fn tcp_locator(port: u16) -> [u8; 24] {
+    const LOGICAL_PORT: u32 = 7411;
+    let mut locator = [0; 24];
+    locator[0] = 4;
+    locator[4..8].copy_from_slice(&(LOGICAL_PORT << 16 | u32::from(port)).to_le_bytes());
+    locator[20..].copy_from_slice(&[127, 0, 0, 1]);
+    locator
+}
+
+/// Runs OpenSSL on a host.
+fn openssl(host: &Namespace, arguments: &str) -> Result<Process> {
+    let arguments = arguments.split(' ');
+    Process::start_with(&host.on_network(), "openssl", arguments, Stdio::null())
+}
+
+/// Connects a client of OpenSSL to a server.
+fn connect_encrypted(host: &Namespace, port: u16) -> Result<Process> {
+    let mut client = openssl(host, &format!("s_client -connect 127.0.0.1:{port}"))?;
+    client.line_with_end("(self-signed certificate)", MATCHED_WITHIN)?;
+    Ok(client)
+}
+
+/// Starts a server of OpenSSL, and connects a client to it.
+fn encrypted_connection(host: &Namespace, directory: &Path, port: u16) -> Result<[Process; 2]> {
+    let [key, certificate] = ["key.pem", "certificate.pem"].map(|name| directory.join(name));
+    run(&format!(
+        "openssl req -x509 -newkey rsa:2048 -nodes -days 2 -subj /CN=robot -keyout {} -out {}",
+        key.display(),
+        certificate.display()
+    ))?;
+    let (key, certificate) = (key.display(), certificate.display());
+    let arguments = format!("s_server -accept 127.0.0.1:{port} -key {key} -cert {certificate}");
+    let server = openssl(host, &arguments)?;
+    let mut connected = None;
+    wait_until("a connection with TLS", || {
+        connected = connect_encrypted(host, port).ok();
+        Ok(connected.is_some())
+    })?;
+    Ok([server, connected.context("no client")?])
+}
+
+// Coverage: TCP, with TLS | Fast DDS | - | named
+#[test]
+fn a_connection_with_tls_to_an_announced_port_is_counted_and_a_plain_one_is_not() -> Result<()> {
+    const ENCRYPTED: &str = "ros2probe_rtps_tcp_tls_connections_total";
+    let host = Namespace::isolated()?;
+    let directory = tempfile::tempdir()?;
+    let socket = directory.path().join("api.sock");
+    let api = format!("api: {{socket: {}}}\n", socket.display());
+    let observer = Observer::start(&host, &format!("{api}{}", at_the_sockets_of(&host)))?;
+    let agent = &observer.agent;
+
+    // A plain connection of RTPS, and one with TLS at a port that no participant announces.
+    let mut connections = Connections::open(&host, 1)?;
+    let talker = Talker::new(1, "/plain");
+    let plain = connections.ends[0][1].local_addr()?.port();
+    introduce(&talker, &mut connections)?;
+    agent.scrape_until("the writer", |page| {
+        page.value("ros2_topic_publishers", &[("topic", "/plain")]) == Some(1.0)
+    })?;
+    let _other = encrypted_connection(&host, directory.path(), PORT + 1)?;
+    let [_server, first] = encrypted_connection(&host, directory.path(), PORT)?;
+    let locators = [tcp_locator(plain), tcp_locator(PORT)];
+    connections.send(&talker.participant_at(&locators))?;
+    let page = agent.scrape_until("the encrypted connection", |page| {
+        page.value(ENCRYPTED, &[]).is_some_and(|count| count > 0.0)
+    })?;
+    assert_eq!(page.value(ENCRYPTED, &[]), Some(1.0), "{}", page.0);
+    // With the participant still known, another connection counts, too.
+    connections.send(&talker.participant_at(&locators))?;
+    // The server has one client at a time.
+    drop(first);
+    let second = connect_encrypted(&host, PORT)?;
+    agent.scrape_until("the second connection", |page| {
+        page.value(ENCRYPTED, &[]) == Some(2.0)
+    })?;
+    drop(second);
+    let doctor = crate::rp()
+        .args(["doctor", "--socket"])
+        .arg(&socket)
+        .output()?;
+    let doctor = String::from_utf8_lossy(&doctor.stdout).into_owned();
+    ensure!(
+        doctor.contains("2 connections of RTPS over TCP are encrypted with TLS"),
+        "{doctor}"
+    );
     Ok(())
 }
 

@@ -23,6 +23,8 @@ const RP: &str = env!("CARGO_BIN_EXE_rp");
 const PATIENCE: Duration = Duration::from_secs(60);
 /// Time to settle: longer than the second after which a gap is a loss.
 const SETTLE: Duration = Duration::from_secs(2);
+/// Time after which the agent has written its state: 3 s after a change, with a margin.
+const WRITTEN_AFTER: Duration = Duration::from_secs(4);
 /// Number of messages that the publisher sends without a pause.
 const STRETCH: u64 = 100;
 const TOPIC: [(&str, &str); 1] = [("topic", "/imu")];
@@ -126,6 +128,8 @@ struct Robot<'n> {
     sent: u64,
     /// Whether sessions are older than the agent.
     is_late: bool,
+    /// Time at which the first agent had all names.
+    known_since: Option<Instant>,
 }
 
 fn one_order(stack: Stack, order: &[Part]) -> Result<()> {
@@ -140,6 +144,7 @@ fn one_order(stack: Stack, order: &[Part]) -> Result<()> {
         subscriber: None,
         sent: 0,
         is_late: false,
+        known_since: None,
     };
     for part in order {
         if *part == Part::Agent && robot.is_whole() {
@@ -223,7 +228,12 @@ impl<'n> Robot<'n> {
 
     /// Kills the agent after it has saved its state, and starts it again.
     fn restart_agent(&mut self) -> Result<()> {
-        std::thread::sleep(Duration::from_secs(4));
+        let known_since = self.known_since.context("no names")?;
+        std::thread::sleep(WRITTEN_AFTER.saturating_sub(known_since.elapsed()));
+        let written = [("outcome", "written")];
+        self.agent()?.scrape_until("a written state", |page| {
+            page.sum("ros2probe_state_writes_total", &written) >= 1.0
+        })?;
         self.agent()?.process.signal("KILL")?;
         self.agent = None;
         self.agent = Some(self.start_agent()?);
@@ -311,6 +321,7 @@ impl<'n> Robot<'n> {
             Ok((idle(&found) == none, found))
         })
         .context("before the messages")?;
+        self.known_since.get_or_insert_with(Instant::now);
         let before = self.agent()?.scrape()?;
         self.send()?;
         self.reaches(|robot| {

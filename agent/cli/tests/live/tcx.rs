@@ -3,22 +3,21 @@
 
 use std::net::{Ipv4Addr, UdpSocket};
 use std::path::Path;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use anyhow::{Context as _, Result, ensure};
-use ros2probe_capture::bpf::count_programs;
-use ros2probe_capture::interfaces::Interfaces;
+use anyhow::{Result, ensure};
 use ros2probe_capture::netns;
-use ros2probe_capture::tcx::{self, BPF_TCX_EGRESS, BPF_TCX_INGRESS};
+use ros2probe_capture::tcx;
 use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE, get};
 use ros2probe_testing::harness::network::{INTERFACE, Link, Namespace};
 use ros2probe_testing::harness::run;
+use ros2probe_testing::harness::tcx::{attached, wait_attached};
 use ros2probe_testing::program_run;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 
 const WRITER: Guid = Guid::new(GuidPrefix(*b"\x01\x0flatetcxwri"), EntityId([0, 0, 1, 3]));
 /// Maximum wait for the kernel or the agent.
-const PATIENCE: Duration = Duration::from_secs(20);
+const PATIENCE: Duration = Duration::from_secs(60);
 const HEALTH: &str = "http://127.0.0.1:17401/health";
 const HOOK: &str = "ros2probe_capture_wire_info";
 
@@ -26,36 +25,6 @@ fn start<'a>(host: &'a Namespace, directory: &Path, configuration: &str) -> Resu
     let file = directory.join("ros2probe.yaml");
     std::fs::write(&file, configuration)?;
     Agent::start(host, env!("CARGO_BIN_EXE_rp"), &file)
-}
-
-/// Returns the programs at an interface of a host, for received and for sent packets.
-fn attached(host: &Namespace, interface: &str) -> Result<[u32; 2]> {
-    let count = netns::within(&host.network(), || -> Result<[u32; 2]> {
-        let interfaces = Interfaces::open()?;
-        let found = interfaces.iter().find(|it| it.name == interface);
-        let index = found.context("the interface does not exist")?.index;
-        let [ingress, egress] = [BPF_TCX_INGRESS, BPF_TCX_EGRESS];
-        Ok([
-            count_programs(index, ingress)?,
-            count_programs(index, egress)?,
-        ])
-    })?;
-    count.with_context(|| format!("{interface} of {}", host.name()))
-}
-
-fn wait_attached(host: &Namespace, interface: &str, programs: [u32; 2]) -> Result<()> {
-    let deadline = Instant::now() + PATIENCE;
-    loop {
-        let found = attached(host, interface)?;
-        if found == programs {
-            return Ok(());
-        }
-        ensure!(
-            Instant::now() < deadline,
-            "{interface}: {found:?} programs, not {programs:?}"
-        );
-        std::thread::sleep(Duration::from_millis(10));
-    }
 }
 
 #[test]
@@ -75,8 +44,8 @@ fn a_killed_agent_leaves_no_program_at_an_interface() -> Result<()> {
     ensure!(attached(&link.robot, INTERFACE)? == [1, 1]);
     ensure!(attached(&link.robot, "lo")? == [1, 0]);
     agent.process.signal("KILL")?;
-    wait_attached(&link.robot, INTERFACE, [0, 0])?;
-    wait_attached(&link.robot, "lo", [0, 0])
+    wait_attached(&link.robot, INTERFACE, [0, 0], PATIENCE)?;
+    wait_attached(&link.robot, "lo", [0, 0], PATIENCE)
 }
 
 #[test]
@@ -104,7 +73,7 @@ fn an_interface_that_appears_later_is_observed_and_one_that_leaves_is_not() -> R
         ] {
             run(&command)?;
         }
-        wait_attached(host, "late", [1, 1])?;
+        wait_attached(host, "late", [1, 1], PATIENCE)?;
         let sender = netns::within(&host.network(), || UdpSocket::bind((address, 0)))??;
         let payload = program_run::message(WRITER, u32::from(octet)..=u32::from(octet), 64);
         sender.send_to(&payload, (Ipv4Addr::new(10, 98, octet, 9), 7411))?;
@@ -123,7 +92,7 @@ fn an_interface_that_appears_later_is_observed_and_one_that_leaves_is_not() -> R
         monitor.name()
     ))?;
     // The other tap attaches its own programs.
-    wait_attached(monitor, "moved", [1, 1])
+    wait_attached(monitor, "moved", [1, 1], PATIENCE)
 }
 
 #[test]

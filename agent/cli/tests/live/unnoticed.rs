@@ -17,10 +17,14 @@ use ros2probe_testing::harness::capture::{self, Capture};
 use ros2probe_testing::harness::dissection::{Content, Dissection, Frame};
 use ros2probe_testing::harness::network::{INTERFACE, Link, Namespace};
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
+use ros2probe_testing::harness::wait_until;
 
 /// Traffic of the kernels themselves: address resolution, multicast membership, IPv6 neighbours.
 const KERNEL_PROTOCOLS: [&str; 3] = ["arp", "igmp", "icmpv6"];
-const PHASE: Duration = Duration::from_secs(2);
+/// Number of samples of each publisher in a phase: a second on a machine that is not busy.
+const PHASE: usize = 50;
+/// Time after a phase in which the recording gets its frames.
+const RECORDED_TIME: Duration = Duration::from_secs(2);
 /// State LISTEN in `/proc/net/tcp`.
 const LISTENING: &str = "0A";
 
@@ -30,13 +34,13 @@ fn running_nodes_send_the_same_before_during_and_after_an_agent() -> Result<()> 
     let directory = tempfile::tempdir()?;
     let mut nodes = Nodes::start(&link)?;
     nodes.go()?;
-    std::thread::sleep(PHASE);
+    nodes.wait_phase()?;
     let recording = Capture::start(&link.robot, &directory.path().join("link.pcap"))?;
     let mut phases = vec![unix_seconds()];
-    std::thread::sleep(PHASE);
+    nodes.wait_phase()?;
     phases.push(unix_seconds());
     let mut agent = start_agent(&link.robot, directory.path())?;
-    std::thread::sleep(PHASE);
+    nodes.wait_phase()?;
     // The agent started after most announcements, but sees the traffic.
     let messages = |page: &Scrape| {
         page.sum("ros2_topic_messages_total", &[])
@@ -45,7 +49,8 @@ fn running_nodes_send_the_same_before_during_and_after_an_agent() -> Result<()> 
     agent.scrape_until("messages", |page| messages(page) > 100.0)?;
     agent.process.terminate()?;
     phases.push(unix_seconds());
-    std::thread::sleep(PHASE.max(capture::SETTLE));
+    nodes.wait_phase()?;
+    std::thread::sleep(capture::SETTLE);
     let ports = nodes.ports()?;
     let (known, writers) = (guids(nodes.all())?, guids(nodes.publishers.iter())?);
     let frames = Dissection::read(&recording.finish()?)?.frames;
@@ -94,7 +99,8 @@ fn nodes_that_start_beside_an_agent_announce_the_same_as_without_it() -> Result<
         let recording = Capture::start(&link.robot, &directory.path().join("link.pcap"))?;
         let mut nodes = Nodes::start(&link)?;
         nodes.go()?;
-        std::thread::sleep(PHASE);
+        nodes.wait_phase()?;
+        std::thread::sleep(RECORDED_TIME);
         let (ports, known) = (nodes.ports()?, guids(nodes.all())?);
         let frames = Dissection::read(&recording.finish()?)?.frames;
         drop(agent);
@@ -250,6 +256,20 @@ impl Nodes {
 
     fn go(&mut self) -> Result<()> {
         self.publishers.iter_mut().try_for_each(Peer::start_sending)
+    }
+
+    /// Waits until each publisher has sent the samples of one phase.
+    fn wait_phase(&self) -> Result<()> {
+        let sent = |peer: &Peer| -> Result<usize> { Ok(peer.log()?.sequences("pub").len()) };
+        let before: Vec<usize> = self.publishers.iter().map(sent).collect::<Result<_>>()?;
+        wait_until("each publisher has sent the samples of a phase", || {
+            for (publisher, before) in self.publishers.iter().zip(&before) {
+                if sent(publisher)? < before + PHASE {
+                    return Ok(false);
+                }
+            }
+            Ok(true)
+        })
     }
 
     fn all(&self) -> impl Iterator<Item = &Peer> {

@@ -47,7 +47,7 @@ await scenario(async (open) => {
   // Hidden: after ten seconds the agent has one stream less to compute.
   await tab.page.getByRole('navigation').getByRole('link', { name: 'Events' }).click();
   await tab.shows('/night_watch');
-  assert.equal((await ask('streams')).live, 1);
+  await until('one stream', async () => (await ask('streams')).live === 1);
   await tab.page.evaluate(() => globalThis.becomeVisible(false));
   await until('the stream is closed', async () => (await ask('streams')).live === 0);
   await ask('a node while hidden');
@@ -58,10 +58,16 @@ await scenario(async (open) => {
   await until('the stream is open', async () => (await ask('streams')).live === 1);
   // The stream stays open while the tab is hidden only briefly.
   const opened = () => tab.requests.filter((request) => request.url().endsWith('/live')).length;
-  const before = opened();
-  await tab.page.evaluate(() => globalThis.becomeVisible(false));
-  await new Promise((wake) => setTimeout(wake, 2000));
-  await tab.page.evaluate(() => globalThis.becomeVisible(true));
-  await tab.live();
-  assert.equal(opened(), before);
+  let isBrief = false;
+  for (let round = 0; !isBrief; round += 1) {
+    assert.ok(round < 10, 'each time the tab was hidden for long');
+    const [before, began] = [opened(), Date.now()];
+    await tab.page.evaluate(() => globalThis.becomeVisible(false));
+    await new Promise((wake) => setTimeout(wake, 2000));
+    await tab.page.evaluate(() => globalThis.becomeVisible(true));
+    // A busy machine may hide the tab for longer.
+    isBrief = Date.now() < began + 8000;
+    await tab.live();
+    if (isBrief) assert.equal(opened(), before);
+  }
 });

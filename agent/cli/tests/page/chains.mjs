@@ -78,9 +78,7 @@ async function keys(tab) {
   // A part of a longer chain, with a single hop, so that no hop is marked as the slowest.
   await until('one hop', async () => (await rows(tab).count()) === 2);
   assert.equal(await tab.page.locator('.waterfall .badge').count(), 0);
-  await tab.page.keyboard.press('g');
-  await tab.page.keyboard.press('c');
-  await tab.heading('Chains');
+  await tab.jump('c', 'Chains');
 }
 
 async function bars(tab) {

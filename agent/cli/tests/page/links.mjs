@@ -13,8 +13,9 @@ await scenario(async (open) => {
   const row = table.locator('tbody tr', { hasText: `${source} → ${destination}` });
   await until('segments that were sent again', async () => {
     const cells = await row.locator('td').allInnerTexts();
-    const [protocol, connections, roundTrip, , , again] = cells;
+    const [protocol, connections, roundTrip, unsent, , , again] = cells;
     return protocol === 'RTPS' && Number(connections) >= 1 && /[\d.]+ (µs|ms)/.test(roundTrip)
+      && /^[\d.]+ [kM]?B$/.test(unsent)
       && /^[1-9][\d,]* \([\d.]+ %\)$/.test(again);
   });
   assert.match(await tab.page.locator('#links').innerText(), /TCP links to other hosts/);

@@ -50,12 +50,14 @@ await scenario(async (open) => {
   await until('what was not shown', async () => /\d+ not shown before it/
     .test(await section.innerText()));
   // While the tree is closed, the agent decodes nothing.
-  assert.equal((await ask('streams')).messages, 1);
+  await until('one stream', async () => (await ask('streams')).messages === 1);
   await section.getByRole('button', { name: 'Close' }).click();
   await until('the agent is left alone', async () => (await ask('streams')).messages === 0);
-  assert.equal(followed(), 1);
+  // A busy agent may have ended a stream, which the page opens again.
+  const requested = followed();
+  assert.ok(requested >= 1);
   // The next topic stays closed, too.
   await tab.go('#/topics/%2Fscan?domain=0');
   await section.getByRole('button', { name: 'Show messages' }).waitFor();
-  assert.equal(followed(), 1);
+  assert.equal(followed(), requested);
 });

@@ -30,7 +30,13 @@ await scenario(async (open) => {
   await there(charts);
   assert.ok(page.url().includes(`at=${end}`), page.url());
   const rate = charts.filter({ has: page.getByRole('heading', { name: 'Rate' }) });
-  await reads(rate, /maximum 20\d Hz/);
+  // The chart has the maximum of the history, which a busy machine changes.
+  const { rate_hertz: hertz } = await page.evaluate((path) => fetch(path).then((answer) => answer.json()),
+    `topics/%2Fimu/history?from=${begin}&to=${end}`);
+  const most = Math.max(...hertz.filter((value) => value != null));
+  const shown = await until('the maximum rate', async () =>
+    Number(/maximum (\d[\d.]*) Hz/.exec(await rate.innerText())?.[1]));
+  assert.ok(most > 20 && Math.abs(shown - most) < 0.02 * most, `${shown} Hz, not ${most} Hz`);
   await tab.accessible('a topic of the past');
 
   // A part of a chart is dragged over, and shown alone; the browser's Back returns.

@@ -7,10 +7,10 @@ import { reads, scenario, there } from './tab.mjs';
 const PARTS = [
   ['logs', [/error\s+\/lidar\s+no echo from <b>sector<\/b> 3/, /1 info/, /errors 1[^]*a bar is a minute/]],
   ['diagnostics', [/error\s+battery\s+nearly empty/, /ok\s+lidar: connection/]],
-  ['transforms', [/map\s+odom[^]*\/ekf\s+\(1\.50, 0\.00, 0\.00\)\s+base_link/, /Age of stamp/, /Jumps/]],
+  ['transforms', [/Age of stamp\s+Extrapolation\s+Jumps/, /map\s+odom[^]*–\s+–\s+0\s+\/ekf\s+\(1\.50, 0\.00, 0\.00\)\s+base_link/]],
   ['parameters', [/\/planner speed\s+5\s+7/, /\/planner\s+speed\s+7/]],
-  ['services', [/No service so far|Services/]],
-  ['clocks', [/No message of another host|Ahead at least/]],
+  ['services', [/No service so far\./]],
+  ['clocks', [/No message of another host so far\./]],
 ];
 
 await scenario(async (open) => {

@@ -294,9 +294,7 @@ async function keys(tab) {
   await tab.escape();
   for (const [key, name] of [['t', 'Topics'], ['g', 'Graph'], ['c', 'Chains'], ['n', 'Nodes'],
     ['e', 'Events'], ['r', 'Recordings'], ['a', 'Agent'], ['o', 'Overview']]) {
-    await tab.page.keyboard.press('g');
-    await tab.page.keyboard.press(key);
-    await tab.heading(name);
+    await tab.jump(key, name);
     await until('the title', async () => (await tab.page.title()).startsWith(`${name} · `));
   }
   // Pause closes the stream; a notice explains that the figures are not updated.

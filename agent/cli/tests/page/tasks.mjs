@@ -29,8 +29,7 @@ const TASKS = {
     });
   },
   async 'content and plot of a number'(tab, click) {
-    await tab.page.keyboard.press('/');
-    await tab.page.keyboard.type('/imu');
+    await tab.search('/imu');
     await tab.page.keyboard.press('Enter');
     const section = tab.page.locator('section[aria-labelledby="live"]');
     await click(section.getByRole('button', { name: 'Plot linear_acceleration.z' }));
@@ -67,8 +66,7 @@ const TASKS = {
   },
   async 'a node among many'(tab) {
     const { node } = await ask('node');
-    await tab.page.keyboard.press('/');
-    await tab.page.keyboard.type(node);
+    await tab.search(node);
     await tab.page.keyboard.press('Enter');
     await until('its view', async () => tab.fragment().includes(encodeURIComponent(node)));
     await reads(tab.page.locator('main'), 'Process');

@@ -9,7 +9,14 @@ await scenario(async (open) => {
   await tab.live();
   const row = tab.page.locator('main tbody tr[data-row]', { hasText: '/scan' });
   await row.waitFor();
-  const before = await ask('watches');
+  // The agent knows all writers once two answers are the same.
+  let before = null;
+  await until('the same writers as before', async () => {
+    const now = await ask('watches');
+    const isSame = before?.interest === now.interest;
+    before = now;
+    return isSame;
+  });
   assert.deepEqual(before.topics, [], 'nothing is measured at first');
   assert.match(await row.innerText(), /–/, 'no rate');
 

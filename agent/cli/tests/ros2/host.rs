@@ -15,18 +15,6 @@ use tempfile::TempDir;
 use crate::installed;
 
 pub const RP: &str = env!("CARGO_BIN_EXE_rp");
-const UDP_ONLY: &str = r#"<?xml version="1.0" encoding="UTF-8"?>
-<profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
-  <transport_descriptors>
-    <transport_descriptor><transport_id>udp</transport_id><type>UDPv4</type></transport_descriptor>
-  </transport_descriptors>
-  <participant profile_name="udp" is_default_profile="true"><rtps>
-    <userTransports><transport_id>udp</transport_id></userTransports>
-    <useBuiltinTransports>false</useBuiltinTransports>
-  </rtps></participant>
-</profiles>
-"#;
-
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub enum Middleware {
     /// Shared memory, which the agent samples.
@@ -51,7 +39,7 @@ pub struct Host<'n> {
 impl<'n> Host<'n> {
     pub fn new(network: &'n Namespace, middleware: Middleware) -> Result<Self> {
         let directory = tempfile::tempdir()?;
-        fs::write(directory.path().join("udp.xml"), UDP_ONLY)?;
+        fs::write(directory.path().join("udp.xml"), udp_only(""))?;
         Ok(Self {
             network,
             middleware,
@@ -186,4 +174,23 @@ impl<'n> Host<'n> {
         let line = format!("exec {python} {directory}/{script} \"$@\"");
         self.run(&line, arguments, Stdio::inherit())
     }
+}
+
+/// Returns a profile of Fast DDS with UDP alone, and these elements of its transport.
+pub fn udp_only(elements: &str) -> String {
+    format!(
+        r#"<?xml version="1.0" encoding="UTF-8"?>
+<profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
+  <transport_descriptors>
+    <transport_descriptor>
+      <transport_id>udp</transport_id><type>UDPv4</type>{elements}
+    </transport_descriptor>
+  </transport_descriptors>
+  <participant profile_name="udp" is_default_profile="true"><rtps>
+    <userTransports><transport_id>udp</transport_id></userTransports>
+    <useBuiltinTransports>false</useBuiltinTransports>
+  </rtps></participant>
+</profiles>
+"#
+    )
 }

@@ -19,7 +19,7 @@ use rustix::net::{
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-const PATIENCE: Duration = Duration::from_secs(20);
+const PATIENCE: Duration = Duration::from_secs(60);
 
 /// Maps the file of the first argument as a library. With the second argument `stuck`, reads of its
 /// environment block forever (userfaultfd(2)).
@@ -223,7 +223,7 @@ fn an_environment_whose_read_blocks_delays_no_request() {
         assert_eq!(broker.domain(stuck.id()).unwrap(), Some(42));
     }
     assert!(
-        began.elapsed() < Duration::from_secs(5),
+        began.elapsed() < Duration::from_secs(30),
         "{:?}",
         began.elapsed()
     );
@@ -458,7 +458,7 @@ fn ten_thousand_requests_and_clients_that_never_read_leave_the_memory_unchanged(
     let began = Instant::now();
     assert_eq!(broker.processes().unwrap().is_empty(), all.is_empty());
     assert!(
-        began.elapsed() < Duration::from_secs(5),
+        began.elapsed() < Duration::from_secs(30),
         "{:?}",
         began.elapsed()
     );

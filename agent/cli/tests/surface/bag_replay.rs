@@ -196,6 +196,46 @@ fn a_damaged_bag_is_replayed_as_far_as_possible_and_says_so() {
     }
 }
 
+/// Earlier, the agent served its page, and then reported that the rest of the capture was unreadable.
+#[test]
+fn an_agent_refuses_a_bag_without_its_files_before_it_serves_anything() {
+    let directory = tempfile::tempdir().unwrap();
+    let bag = copy(&repository(REAL), &directory.path().join("drive"));
+    let file = bag.join("bag_zstd_fast_0.mcap");
+    let path = bag.to_str().unwrap();
+    let refused = |reason: &str| {
+        let output = run(&["run", "--replay", path, "--metrics", "127.0.0.1:0"]);
+        assert_eq!(output.status.code(), Some(1));
+        let file = file.display();
+        let expected = format!(
+            "rp: cannot replay {path}: {}\n",
+            reason.replace('F', &file.to_string())
+        );
+        assert_eq!(stderr(&output), expected);
+    };
+    let whole = fs::read(&file).unwrap();
+    fs::remove_file(&file).unwrap();
+    refused("cannot read F: No such file or directory (os error 2)");
+    fs::write(&file, b"another").unwrap();
+    refused("F is neither an MCAP file nor a sqlite3 bag");
+
+    // Of a bag with several files, the others are replayed, and the missing one is reported.
+    fs::write(&file, whole).unwrap();
+    let description = bag.join("metadata.yaml");
+    let text = fs::read_to_string(&description).unwrap();
+    let entry = "    - bag_zstd_fast_0.mcap\n";
+    assert!(text.contains(entry), "{text}");
+    let more = format!("    - lost.mcap\n{entry}");
+    fs::write(&description, text.replacen(entry, &more, 1)).unwrap();
+    let output = run(&["topic", "list", "--replay", path]);
+    assert!(output.status.success() && stdout(&output).lines().count() > 2);
+    let said = stderr(&output);
+    assert!(
+        said.contains("lost.mcap was not read: No such file"),
+        "{said}"
+    );
+}
+
 #[test]
 fn messages_that_are_not_cdr_are_skipped_and_counted() {
     let directory = tempfile::tempdir().unwrap();

@@ -306,7 +306,7 @@ fn a_pipe_instead_of_a_file_is_refused_without_waiting() {
     ] {
         let mut rp = rp();
         rp.args(arguments).current_dir(directory.path());
-        let (output, time) = within(rp, Duration::from_secs(10));
+        let (output, time) = within(rp, Duration::from_secs(60));
         let printed = String::from_utf8_lossy(&output.stderr);
         let printed = printed.into_owned() + &String::from_utf8_lossy(&output.stdout);
         println!("{arguments:?} after {time:?}: {printed}");

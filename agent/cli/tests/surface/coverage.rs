@@ -7,7 +7,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 const COVERAGE_MARK: &str = "// Coverage: ";
-const VERDICTS: [&str; 3] = ["exact", "counted", "named"];
+const VERDICTS: [&str; 4] = ["exact", "counted", "named", "unseen"];
 const BEGIN: &str = "<!-- coverage: generated from the tests -->\n";
 const END: &str = "<!-- coverage: end";
 
@@ -37,7 +37,7 @@ fn rows(root: &Path) -> BTreeMap<[String; 4], Vec<String>> {
         let text = fs::read_to_string(&path).unwrap();
         let mut marked = Vec::new();
         let mut is_test = false;
-        for line in text.lines() {
+        for line in text.lines().map(str::trim_start) {
             if let Some(row) = line.strip_prefix(COVERAGE_MARK) {
                 let cells: Vec<String> = row.split(" | ").map(str::to_owned).collect();
                 let cells = <[String; 4]>::try_from(cells).unwrap();

@@ -311,6 +311,7 @@ fn participants_with_dds_security_or_without_an_address_are_not_contacted() {
         addresses: Addresses {
             metatraffic: metatraffic.iter().map(|it| it.parse().unwrap()).collect(),
             default: ["127.0.0.1:7411".parse().unwrap()].into(),
+            tcp: Box::default(),
         },
     };
     let asked = |secured, addresses: &[&str]| {

@@ -115,8 +115,8 @@ async fn prometheus_and_an_otlp_receiver_get_the_same_exemplars_of_a_chain() {
     agent.wait_for_log("the capture has ended");
     // The exemplars do not change after this point.
     let prometheus = Prometheus::start(directory.path(), agent.address);
-    let deadline = Instant::now() + PATIENCE;
     for family in FAMILIES {
+        let deadline = Instant::now() + PATIENCE;
         let both = loop {
             let exported = receiver.0.lock().unwrap().get(family).cloned();
             let both = (stored(&prometheus, family), exported.unwrap_or_default());

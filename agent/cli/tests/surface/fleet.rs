@@ -3,7 +3,12 @@
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::process::{Child, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
+
+use ros2probe_testing::local_agent::{self, LocalAgent, call_api};
+use serde_json::Value;
 
 use crate::rp;
 
@@ -269,4 +274,109 @@ fn connections_beyond_the_cap_wait_until_silent_ones_are_closed() {
     assert!(answer.starts_with("HTTP/1.1 200 OK"), "{answer}");
     assert!(begun.elapsed() > Duration::from_secs(1), "it did not wait");
     drop(silent);
+}
+
+/// Starts an agent with this section of the configuration.
+fn agent(directory: &std::path::Path, fleet: &str) -> LocalAgent {
+    let configuration = directory.join("ros2probe.yaml");
+    std::fs::write(&configuration, fleet).unwrap();
+    let configuration = configuration.to_str().unwrap();
+    LocalAgent::start(&mut rp(), &["--config", configuration, "--speed", "max"])
+}
+
+/// Returns the answer of `GET /fleet` once it is as wanted.
+fn fleet_of(agent: &LocalAgent, wanted: impl Fn(&Value) -> bool) -> Value {
+    let begun = Instant::now();
+    loop {
+        let (status, answer) = call_api(agent.api, "GET", "/fleet", "");
+        assert_eq!(status, 200, "{answer}");
+        if wanted(&answer) {
+            return answer;
+        }
+        assert!(begun.elapsed() < PATIENCE, "{answer}");
+        std::thread::sleep(Duration::from_millis(50));
+    }
+}
+
+#[test]
+fn an_agent_queries_the_engine_only_on_demand() {
+    let directory = tempfile::tempdir().unwrap();
+    let count = Arc::new(AtomicUsize::new(0));
+    let counted = Arc::clone(&count);
+    let counting = engine(move |out| {
+        counted.fetch_add(1, Ordering::Relaxed);
+        let text = r#"{"status":"success","data":{"resultType":"vector","result":[]}}"#;
+        let length = text.len();
+        write!(
+            out,
+            "HTTP/1.1 200 OK\r\nContent-Length: {length}\r\n\r\n{text}"
+        )
+    });
+    let yaml = format!("fleet: {{engine: 'http://{counting}'}}\n");
+    let mut agent = agent(directory.path(), &yaml);
+    agent.wait_for_log("the capture has ended");
+    let (status, _) = call_api(agent.api, "GET", "/health", "");
+    assert_eq!((status, count.load(Ordering::Relaxed)), (200, 0));
+    let answer = fleet_of(&agent, |answer| answer["at"].is_number());
+    assert_eq!(answer["robots"], Value::Array(Vec::new()));
+    assert_eq!(answer["problem"], Value::Null);
+    assert!(count.load(Ordering::Relaxed) >= 10, "one query each");
+    agent.signal("-TERM");
+    assert!(agent.wait().success());
+}
+
+#[test]
+fn an_agent_reports_why_the_engine_does_not_answer_or_that_it_has_none() {
+    let directory = tempfile::tempdir().unwrap();
+    let nowhere = TcpListener::bind("127.0.0.1:0")
+        .unwrap()
+        .local_addr()
+        .unwrap();
+    let yaml = format!("fleet: {{engine: 'http://{nowhere}'}}\n");
+    let with_engine = agent(directory.path(), &yaml);
+    let answer = fleet_of(&with_engine, |answer| answer["problem"].is_string());
+    let problem = answer["problem"].as_str().unwrap();
+    assert!(problem.contains("the connection failed"), "{problem}");
+    assert_eq!(answer["at"], Value::Null);
+    let without = agent(directory.path(), "{}\n");
+    let (status, answer) = call_api(without.api, "GET", "/fleet", "");
+    let kind = answer["type"].as_str().unwrap();
+    assert!(status == 404 && kind.ends_with("no-fleet"), "{answer}");
+}
+
+#[test]
+fn an_agent_refuses_an_answer_beyond_the_cap() {
+    let directory = tempfile::tempdir().unwrap();
+    // Blanks before the answer are valid JSON.
+    let long = engine(|out| {
+        let text = r#"{"status":"success","data":{"resultType":"vector","result":[]}}"#;
+        let length = (4 << 20) + 1;
+        write!(out, "HTTP/1.1 200 OK\r\nContent-Length: {length}\r\n\r\n")?;
+        out.write_all(&vec![b' '; length - text.len()])?;
+        out.write_all(text.as_bytes())
+    });
+    let yaml = format!("fleet: {{engine: 'http://{long}'}}\n");
+    let agent = agent(directory.path(), &yaml);
+    let answer = fleet_of(&agent, |answer| answer["problem"].is_string());
+    let problem = answer["problem"].as_str().unwrap();
+    assert!(problem.contains("cannot receive the answer"), "{problem}");
+}
+
+#[test]
+fn a_token_of_the_engine_that_cannot_be_read_ends_the_start() {
+    let directory = tempfile::tempdir().unwrap();
+    let configuration = directory.path().join("ros2probe.yaml");
+    let token = directory.path().join("token");
+    let yaml = format!(
+        "fleet: {{engine: 'http://127.0.0.1:9', token_file: {}}}\n",
+        token.display()
+    );
+    std::fs::write(&configuration, yaml).unwrap();
+    let mut command = rp();
+    command.args(["run", "--metrics", "off", "--api", "off", "--config"]);
+    command.arg(&configuration).arg("--replay");
+    let output = command.arg(local_agent::capture()).output().unwrap();
+    let text = String::from_utf8(output.stderr).unwrap();
+    assert!(!output.status.success(), "{text}");
+    assert!(text.contains("cannot read `fleet.token_file`"), "{text}");
 }

@@ -9,6 +9,7 @@ use std::net::{SocketAddr, TcpStream};
 use std::process::Command;
 use std::time::{Duration, Instant};
 
+use crate::replay::change;
 use crate::rp;
 use crate::samples::replayed;
 use ros2probe_model::facts::dispatch::SampleOutcome;
@@ -23,6 +24,8 @@ use tokio_tungstenite::tungstenite::Message;
 
 /// Text of the log line that has the address of the listener.
 const SERVING: &str = "serving viewers";
+/// Maximum duration of a replay on a busy machine.
+const REPLAY_PATIENCE: Duration = Duration::from_secs(90);
 const WATCHED: [&str; 4] = ["--foxglove", "127.0.0.1:0", "--watch", "/**"];
 
 /// Starts an agent that replays a capture. Returns the agent and the address for viewers.
@@ -59,7 +62,8 @@ fn descriptors(agent: &LocalAgent) -> usize {
 
 #[test]
 fn a_viewer_gets_the_messages_of_a_capture_as_they_were_sent() {
-    let (agent, address) = agent(&["--speed", "0.5"]);
+    // The replay stays near its begin until the viewer is connected.
+    let (agent, address) = agent(&["--speed", "0.02"]);
     let (_, outcomes) = replayed(&local_agent::capture(), Some(Depth::Payloads));
     let mut expected: BTreeMap<String, Vec<(u64, Vec<u8>)>> = BTreeMap::new();
     for outcome in outcomes {
@@ -84,11 +88,12 @@ fn a_viewer_gets_the_messages_of_a_capture_as_they_were_sent() {
     viewer
         .send(&json!({"op": "subscribeConnectionGraph"}))
         .unwrap();
+    change(&agent, &json!({"speed": 0.5}));
     let mut received: BTreeMap<String, Vec<(u64, Vec<u8>)>> = BTreeMap::new();
     let mut names = BTreeMap::new();
     let (mut clock, mut figures) = (0, BTreeMap::new());
     let mut is_published = false;
-    let deadline = Instant::now() + PATIENCE;
+    let deadline = Instant::now() + REPLAY_PATIENCE;
     loop {
         assert!(Instant::now() < deadline, "the capture does not end");
         match viewer.next_within(PATIENCE).unwrap().expect("no news") {

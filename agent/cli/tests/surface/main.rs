@@ -39,6 +39,7 @@ mod limits;
 mod metrics;
 mod otlp;
 mod otlp_captures;
+mod otlp_parts;
 mod otlp_tls;
 mod page;
 mod recordings;

@@ -16,20 +16,38 @@ use std::time::{Duration, Instant};
 
 use crate::rp;
 use ros2probe_testing::bag_messages::for_each_message;
-use ros2probe_testing::local_agent::{self, LocalAgent, PATIENCE, call_api};
+use ros2probe_testing::local_agent::{self, LocalAgent, call_api};
 use ros2probe_testing::model::capture::{Capture, ETHERNET, reader, writer};
 use ros2probe_wire::GuidPrefix;
 use ros2probe_wire::time::SECOND;
 use serde_json::Value;
+use tempfile::TempPath;
 
 const START: u64 = 1_795_143_000 * SECOND;
 const ALICE: GuidPrefix = GuidPrefix(*b"\x01\x10alice-host");
+/// Maximum wait for an answer, a line or an end on a busy machine.
+const PATIENCE: Duration = Duration::from_secs(90);
 /// Number of topics of a robot with navigation and two cameras.
 const MANY: usize = 171;
 
 /// Starts an agent that may write bags and replays slowly.
 fn agent(directory: &Path, more: &str) -> LocalAgent {
     agent_on(&local_agent::capture(), directory, "0.5", more)
+}
+
+/// Writes a capture of ten minutes with a publisher of `/chatter` at 10 Hz. No test outlasts it.
+pub(crate) fn long_capture() -> TempPath {
+    let file = tempfile::NamedTempFile::with_suffix(".pcap").unwrap();
+    let path = file.into_temp_path();
+    let mut capture = Capture::new(ETHERNET);
+    let source = writer(ALICE, 0);
+    capture.participant(START, 0, ALICE);
+    capture.writer(START + 1, 0, source, "rt/chatter", 1);
+    for number in 1..=6_000 {
+        capture.sample(START + number * SECOND / 10, 0, source, number);
+    }
+    capture.write(&path);
+    path
 }
 
 fn agent_on(capture: &Path, directory: &Path, speed: &str, more: &str) -> LocalAgent {
@@ -81,7 +99,8 @@ fn messages(directory: &Path) -> BTreeMap<String, Vec<u32>> {
 #[test]
 fn a_headless_robot_records_on_request_and_lists_its_recordings() {
     let directory = tempfile::tempdir().unwrap();
-    let agent = agent(directory.path(), "");
+    let capture = long_capture();
+    let agent = agent_on(&capture, directory.path(), "1", "");
     let api = agent.api;
 
     let (status, begun) = call_api(api, "POST", "/recordings", r#"{"name": "drive"}"#);
@@ -146,8 +165,11 @@ fn a_headless_robot_records_on_request_and_lists_its_recordings() {
 fn a_recording_that_reaches_a_limit_ends_with_the_reason_and_the_next_is_refused() {
     use std::os::unix::fs::PermissionsExt as _;
     let directory = tempfile::tempdir().unwrap();
-    let agent = agent(
+    let capture = long_capture();
+    let agent = agent_on(
+        &capture,
         directory.path(),
+        "1",
         "  max_total_bytes: 1000000\n  reserve_bytes: 65536\n  reserve_percent: 0\n",
     );
     let api = agent.api;

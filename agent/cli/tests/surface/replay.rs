@@ -25,7 +25,8 @@ pub(crate) fn wait_for(
     }
 }
 
-fn change(agent: &LocalAgent, change: &Value) -> Value {
+/// Changes the pace of a replay. Returns the replay after the change.
+pub(crate) fn change(agent: &LocalAgent, change: &Value) -> Value {
     let (status, body) = call_api(agent.api, "POST", "/replay", &change.to_string());
     assert_eq!(status, 200, "{change}: {body}");
     body
@@ -65,10 +66,15 @@ fn a_replay_pauses_and_jumps_to_a_time_and_to_the_next_event() {
         change(&agent, &json!({"is_paused": true}))["is_paused"],
         true
     );
-    std::thread::sleep(Duration::from_millis(300));
-    let held = get(&agent, "/replay");
-    std::thread::sleep(Duration::from_millis(1_500));
-    assert_eq!(time(&get(&agent, "/replay")), time(&held));
+    let deadline = Instant::now() + PATIENCE;
+    let held = loop {
+        let held = get(&agent, "/replay");
+        std::thread::sleep(Duration::from_secs(1));
+        if time(&get(&agent, "/replay")) == time(&held) {
+            break held;
+        }
+        assert!(Instant::now() < deadline, "the replay goes on: {held}");
+    };
     let begin = held["begin_timestamp_seconds"].as_f64().unwrap();
     let before = json!({"to_timestamp_seconds": begin - 1.0});
     let (status, _) = call_api(agent.api, "POST", "/replay", &before.to_string());

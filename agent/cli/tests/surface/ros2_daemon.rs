@@ -299,7 +299,7 @@ fn connections_beyond_the_cap_replace_the_longest_idle_one() {
         .wait_for_metric(clients, |count| count == MAX_CLIENTS as f64);
     let begun = Instant::now();
     assert_eq!(call("get_namespace", &[]).status, 200);
-    assert!(begun.elapsed() < Duration::from_secs(5));
+    assert!(begun.elapsed() < Duration::from_secs(30));
     first.set_read_timeout(Some(PATIENCE)).unwrap();
     let ended = first.read(&mut [0]);
     assert!(!matches!(ended, Ok(1..)), "{ended:?}");

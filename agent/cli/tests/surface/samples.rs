@@ -4,9 +4,12 @@
 mod shared_memory;
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::io::{Read as _, Write as _};
+use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use crate::replay::change;
 use crate::rp;
 use bytes::Bytes;
 use ros2probe_api::samples::Line;
@@ -20,7 +23,7 @@ use ros2probe_model::observe::input::Input;
 use ros2probe_model::observe::observer::{Observer, Settings};
 use ros2probe_model::report::snapshot::Snapshot;
 use ros2probe_testing::local_agent;
-use ros2probe_testing::local_agent::LocalAgent;
+use ros2probe_testing::local_agent::{LocalAgent, PATIENCE};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe_wire::record::Verdict;
 use ros2probe_wire::time::SECOND;
@@ -486,15 +489,31 @@ fn samples_beyond_the_cap_in_bytes_are_reported_and_memory_is_bounded() {
 
 #[test]
 fn a_stream_has_the_samples_and_the_time_up_to_which_it_is_complete() {
-    let agent = LocalAgent::start(&mut rp(), &["--speed", "4"]);
-    let answer = local_agent::request(agent.api, "GET", "/samples?all=true", "");
-    assert_eq!(answer.status, 200, "{}", answer.body);
+    // The replay stays near its begin until the stream is open.
+    let agent = LocalAgent::start(&mut rp(), &["--speed", "0.02"]);
+    let mut stream = TcpStream::connect(agent.api).unwrap();
+    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    let path = "/samples?all=true";
+    let request = format!("GET {path} HTTP/1.1\r\nHost: {}\r\n", agent.api);
+    write!(stream, "{request}Connection: close\r\n\r\n").unwrap();
+    let mut answer = Vec::new();
+    while !String::from_utf8_lossy(&answer).contains("\"open\"") {
+        let mut bytes = [0; 4096];
+        let count = stream.read(&mut bytes).unwrap();
+        assert!(count > 0, "{}", String::from_utf8_lossy(&answer));
+        answer.extend_from_slice(&bytes[..count]);
+    }
+    change(&agent, &serde_json::json!({"speed": 4}));
+    stream.read_to_end(&mut answer).unwrap();
+    let answer = String::from_utf8(answer).unwrap();
+    let (head, body) = answer.split_once("\r\n\r\n").unwrap();
+    let head = head.to_lowercase();
+    assert!(head.starts_with("http/1.1 200 "), "{answer}");
     assert!(
-        answer
-            .headers
-            .contains("content-type: application/x-ndjson")
+        head.contains("content-type: application/x-ndjson"),
+        "{head}"
     );
-    let lines = answer.body.lines().filter(|line| line.starts_with('{'));
+    let lines = body.lines().filter(|line| line.starts_with('{'));
     let lines: Vec<Line> = lines
         .map(|line| serde_json::from_str(line).unwrap_or_else(|error| panic!("{line}: {error}")))
         .collect();

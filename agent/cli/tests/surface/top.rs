@@ -3,6 +3,7 @@
 
 use std::time::{Duration, Instant};
 
+use crate::recordings::long_capture;
 use crate::rp;
 use ros2probe_testing::local_agent::{LocalAgent, PATIENCE, capture, request};
 use ros2probe_testing::pseudo_terminal::Terminal;
@@ -130,13 +131,13 @@ fn rp_top_reconnects_to_a_restarted_agent() {
 
 #[test]
 fn a_topic_is_measured_on_request_until_rp_top_ends() {
-    // The capture takes 8 s at this speed, which is long enough for a loaded machine.
-    let agent = LocalAgent::start(&mut rp(), &["--speed", "0.2"]);
+    let capture = long_capture();
+    let agent = LocalAgent::replay(&mut rp(), &capture, &["--speed", "1"]);
     let is_measured = || {
         let topic = request(agent.api, "GET", &format!("/topics{TOPIC}"), "").body;
         let topic: serde_json::Value = serde_json::from_str(&topic).unwrap();
         let publisher = &topic["publishers"][0];
-        assert!(publisher.is_object(), "the capture is over: {topic}");
+        assert!(publisher.is_object(), "{topic}");
         publisher["measurement"].is_object()
     };
     let mut top = top(&agent, &["--filter", TOPIC]);

@@ -16,26 +16,27 @@ use super::check::check;
 use super::document::Node;
 use super::mistake::{Mistakes, Position};
 use super::shape::{
-    ApiShape, CaptureShape, ConfigShape, FoxgloveShape, LogLevelShape, MetricsShape, OtlpShape,
-    PageShape, RecordingsShape, RemoteWriteShape, RobotShape, Ros2DaemonShape, ShipShape,
-    SnapshotShape, Switch, WatchEntryShape, WatchShape,
+    ApiShape, CaptureShape, ConfigShape, FleetShape, FoxgloveShape, LogLevelShape, MetricsShape,
+    OtlpShape, PageShape, RecordingsShape, RemoteWriteShape, RobotShape, Ros2DaemonShape,
+    ShipShape, SnapshotShape, Switch, WatchEntryShape, WatchShape,
 };
 use super::watch::{
     ExpectationValues, Expectations, PatternError, Retain, Watch, check_globs, check_pattern,
 };
 use super::{
-    ApiSettings, CaptureSettings, Config, Endpoint, Extraction, FoxgloveSettings, Level, Limits,
-    MAX_PARAMETERS, MetricsSettings, OtlpSettings, RecordingLimits, RecordingSettings,
-    RemoteWriteSettings, Ros2DaemonSettings, ShipSettings, ShmSettings, SnapshotSettings,
-    SocketChoice, SourceChoice, StateChoice, Windows,
+    ApiSettings, CaptureSettings, Config, Endpoint, Extraction, FleetSettings, FoxgloveSettings,
+    Level, Limits, MAX_PARAMETERS, MetricsSettings, OtlpSettings, RecordingLimits,
+    RecordingSettings, RemoteWriteSettings, Ros2DaemonSettings, ShipSettings, ShmSettings,
+    SnapshotSettings, SocketChoice, SourceChoice, StateChoice, Windows,
 };
 use crate::events::Trigger;
+use crate::fleet::{Link, Question, is_engine};
 use ros2probe_message::filter::{Filter, FilterError};
 use ros2probe_metrics::otlp::otlp_endpoint;
 use ros2probe_metrics::remote_write;
 use ros2probe_model::derive::robot::parameters::ExpectedParameter;
 use ros2probe_model::derive::robot::{Part, Parts};
-use ros2probe_ship::Window;
+use ros2probe_ship::{StoreSettings, Window};
 
 /// Maximum number of configured snapshots; each needs memory and a thread.
 const MAX_SNAPSHOTS: usize = 8;
@@ -166,6 +167,7 @@ impl Reader {
             remote_write: self.remote_write(shape.remote_write.unwrap_or_default()),
             recordings: self.recordings(shape.recordings.unwrap_or_default()),
             ship: ship(shape.ship.unwrap_or_default()),
+            fleet: fleet(shape.fleet.unwrap_or_default()),
             topic_grace: Duration::from_secs(shape.topic_grace_s),
             service_timeout: Duration::from_secs_f64(shape.service_timeout_s),
             retain: shape.retain,
@@ -635,19 +637,38 @@ pub(super) fn check_text(key: &str, text: &str) -> Result<(), InvalidText> {
         {
             Err(InvalidText::RelativePath("`/etc/ros2probe/robot.pem`"))
         }
-        "ship.url" if !ros2probe_ship::is_destination(text) => Err(InvalidText::Unsuitable(
-            "a destination, as in `s3://bucket/prefix`, `gs://bucket`, `az://container` or \
+        "ship.url" | "fleet.store.url" if !ros2probe_ship::is_destination(text) => {
+            Err(InvalidText::Unsuitable(
+                "a destination, as in `s3://bucket/prefix`, `gs://bucket`, `az://container` or \
              `file:///mnt/bags`",
-        )),
-        "ship.endpoint" if remote_write::receiver(text).is_none() => Err(InvalidText::Unsuitable(
-            "the URL of a store, as in `https://minio.example:9000`",
-        )),
+            ))
+        }
+        "ship.endpoint" | "fleet.store.endpoint" if remote_write::receiver(text).is_none() => Err(
+            InvalidText::Unsuitable("the URL of a store, as in `https://minio.example:9000`"),
+        ),
         "ship.instance" if text.is_empty() || text.len() > 128 => Err(InvalidText::Unsuitable(
             "the name of a robot, in at most 128 bytes",
         )),
-        "ship.credentials_file" | "ship.ca_file" if !text.starts_with('/') => {
+        "ship.credentials_file"
+        | "ship.ca_file"
+        | "fleet.store.credentials_file"
+        | "fleet.store.ca_file"
+            if !text.starts_with('/') =>
+        {
             Err(InvalidText::RelativePath("`/etc/ros2probe/ship.env`"))
         }
+        "fleet.engine" if !is_engine(text) => Err(InvalidText::Unsuitable(
+            "the URL of an engine, as in `https://prometheus.example:9090`",
+        )),
+        "fleet.token_file" if !text.starts_with('/') => {
+            Err(InvalidText::RelativePath("`/etc/ros2probe/engine.token`"))
+        }
+        "fleet.job" if text.is_empty() || text.len() > 128 => Err(InvalidText::Unsuitable(
+            "the value of a label, in at most 128 bytes",
+        )),
+        "fleet.link" if text.parse::<Link>().is_err() => Err(InvalidText::Unsuitable(
+            "a URL with `{robot}`, as in `http://{robot}.example:17401/`",
+        )),
         "ship.windows[]" => match text.parse::<Window>() {
             Ok(_) => Ok(()),
             Err(_) => Err(InvalidText::Unsuitable(
@@ -726,6 +747,30 @@ fn ship(shape: ShipShape) -> ShipSettings {
         max_bytes_per_second: shape.max_bytes_per_second,
         windows: Windows(windows.collect()),
         triggered_always: shape.triggered_always,
+    }
+}
+
+fn fleet(shape: FleetShape) -> FleetSettings {
+    let default = Question::default();
+    FleetSettings {
+        engine: shape.engine,
+        token_file: shape.token_file.map(PathBuf::from),
+        question: Question {
+            job: shape.job.unwrap_or(default.job),
+            hours: shape.since_h.unwrap_or(default.hours),
+            reach: shape.reach_s.unwrap_or(default.reach),
+        },
+        link: shape.link.and_then(|link| link.parse().ok()),
+        store: shape.store.and_then(|store| {
+            Some(StoreSettings {
+                url: store.url?,
+                endpoint: store.endpoint,
+                region: store.region,
+                credentials_file: store.credentials_file.map(PathBuf::from),
+                ca_file: store.ca_file.map(PathBuf::from),
+                max_bytes_per_second: None,
+            })
+        }),
     }
 }
 

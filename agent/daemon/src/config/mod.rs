@@ -8,6 +8,7 @@ mod document;
 mod limits;
 mod meaning;
 mod mistake;
+mod readable_tokens;
 mod shape;
 
 use std::collections::BTreeSet;
@@ -23,7 +24,9 @@ use schemars::JsonSchema;
 use serde::Deserialize;
 
 use crate::events::Trigger;
+use crate::fleet::{Link, Question};
 pub use mistake::{Mistake, Mistakes, Position};
+pub use readable_tokens::ReadableToken;
 pub use ros2probe_capture::settings::{
     CaptureSettings, ExactChoice, InsideChoice, LateChoice, ShmMode, ShmSettings, SourceChoice,
     WireChoice,
@@ -40,7 +43,7 @@ pub use ros2probe_model::facts::watch::{
     check_pattern,
 };
 pub use ros2probe_model::measure::rehearsal;
-pub use ros2probe_ship::Windows;
+pub use ros2probe_ship::{StoreSettings, Windows};
 use tracing_subscriber::filter::LevelFilter;
 
 /// Maximum number of parameters that should have a value.
@@ -90,6 +93,8 @@ pub struct Config {
     pub recordings: RecordingSettings,
     /// Delivery of bags by `rp ship`.
     pub ship: ShipSettings,
+    /// The view of a fleet.
+    pub fleet: FleetSettings,
     /// Time for which a topic without endpoints is still reported.
     pub topic_grace: Duration,
     /// Time without a reply after which a call of a service is reported as hanging.
@@ -303,6 +308,21 @@ pub struct ShipSettings {
     pub windows: Windows,
     /// Whether bags of snapshots are delivered outside the windows too.
     pub triggered_always: bool,
+}
+
+/// The view of a fleet.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct FleetSettings {
+    /// URL of the engine; `None` = no view.
+    pub engine: Option<String>,
+    /// File with a bearer token for the engine.
+    pub token_file: Option<PathBuf>,
+    /// The robots.
+    pub question: Question,
+    /// Address of a robot's own page.
+    pub link: Option<Link>,
+    /// Store of the robots' bags.
+    pub store: Option<StoreSettings>,
 }
 
 /// A snapshot: the last seconds of some topics.
@@ -519,6 +539,7 @@ impl Default for Config {
             remote_write: RemoteWriteSettings::default(),
             recordings: RecordingSettings::default(),
             ship: ShipSettings::default(),
+            fleet: FleetSettings::default(),
             topic_grace: Duration::from_secs(defaults::topic_grace_s()),
             service_timeout: Duration::from_secs_f64(defaults::service_timeout_s()),
             retain: RetainChoice::default(),

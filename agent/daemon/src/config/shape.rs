@@ -55,6 +55,8 @@ pub(super) struct ConfigShape {
     pub(super) recordings: Option<RecordingsShape>,
     /// Where `rp ship` delivers finished bags.
     pub(super) ship: Option<ShipShape>,
+    /// The engine to which the robots of a fleet deliver, for the view of the fleet.
+    pub(super) fleet: Option<FleetShape>,
     /// What the robot itself says, in topics of standard types. The agent reads it as it passes, on
     /// watched and other topics.
     pub(super) robot: Option<RobotShape>,
@@ -759,6 +761,50 @@ pub(super) struct ShipShape {
     pub(super) windows: Option<Vec<String>>,
     /// Whether bags of snapshots are delivered outside the windows too.
     pub(super) triggered_always: bool,
+}
+
+/// The view of a fleet on the page (`/fleet`). The agent queries the engine only while a
+/// browser has the view open.
+#[derive(Debug, Default, Deserialize, JsonSchema)]
+#[schemars(inline)]
+#[serde(deny_unknown_fields, default)]
+pub(super) struct FleetShape {
+    /// URL of Prometheus, VictoriaMetrics, Mimir or Thanos, without the path of its API, e.g.
+    /// `https://prometheus.example:9090`. Without it, the page has no view of a fleet.
+    pub(super) engine: Option<String>,
+    /// Absolute path of a file with a bearer token for the engine.
+    pub(super) token_file: Option<String>,
+    /// Value of the label `job` of the robots, `ros2probe` by default.
+    pub(super) job: Option<String>,
+    /// Hours for which a robot without samples is listed as out of reach, 24 by default.
+    #[schemars(range(min = 1, max = 720))]
+    pub(super) since_h: Option<u32>,
+    /// Seconds without samples after which a robot is out of reach, 60 by default.
+    #[schemars(range(min = 1, max = 86_400))]
+    pub(super) reach_s: Option<u32>,
+    /// Address of a robot's own page, with `{robot}` in place of its name, e.g.
+    /// `http://{robot}.example:17401/`.
+    pub(super) link: Option<String>,
+    /// The store to which `rp ship` of the robots delivers: the view lists their incidents.
+    pub(super) store: Option<FleetStoreShape>,
+}
+
+/// The store of the robots' bags, with the keys of `ship`.
+#[derive(Debug, Default, Deserialize, JsonSchema)]
+#[schemars(inline)]
+#[serde(deny_unknown_fields, default)]
+pub(super) struct FleetStoreShape {
+    /// `s3://BUCKET/PREFIX`, `gs://BUCKET/PREFIX`, `az://CONTAINER/PREFIX` or `file:///DIRECTORY`.
+    pub(super) url: Option<String>,
+    /// Address of a store other than that of the provider, e.g. `https://minio.example:9000`.
+    pub(super) endpoint: Option<String>,
+    /// Region of the bucket.
+    pub(super) region: Option<String>,
+    /// Absolute path of a file with credentials that may list and read: lines NAME=value.
+    pub(super) credentials_file: Option<String>,
+    /// Absolute path of a PEM file with the certificate authorities that may sign the store's
+    /// certificate; default: those of the system.
+    pub(super) ca_file: Option<String>,
 }
 
 impl Default for CaptureShape {

@@ -608,6 +608,7 @@ fn finding(finding: &Diagnosis) -> Values {
         Diagnosis::LossyLink {
             link,
             retransmitted_permille,
+            unsent,
         } => vec![
             ("source", written(&link.source)),
             ("destination", written(&link.destination)),
@@ -615,13 +616,7 @@ fn finding(finding: &Diagnosis) -> Values {
                 "retransmitted_ratio",
                 Some(Value::Real(*retransmitted_permille as f64 / 1e3)),
             ),
-        ],
-        Diagnosis::SharedMachineId {
-            domain_id,
-            participants,
-        } => vec![
-            ("domain_id", number(*domain_id)),
-            ("participants", list(participants)),
+            ("unsent_bytes", unsent.map(Value::Number)),
         ],
         Diagnosis::SlowChain {
             from, max_latency, ..

@@ -61,6 +61,7 @@ const FINDING: &[&str] = &[
     "source",
     "destination",
     "retransmitted_ratio",
+    "unsent_bytes",
     "log_errors",
     "log_text",
     "name",
@@ -237,7 +238,7 @@ pub(super) const GRAPH_DIAGNOSED: Definition = Definition::new(
     "Another fault of the graph, named by `diagnosis`: type_conflict, type_hash_conflict, \
      duplicate_node, node_in_several_domains, slow_callback, executor_wait, \
      late_callback, intra_process_overflow, reader_queue_overflow, observation_suspended, \
-     shared_machine_id, lossy_link, log_errors, diagnostic_error, transform_fault, clocks_apart, slow_chain, or (INFO) unmatched_publisher, unmatched_subscription, \
+     lossy_link, log_errors, diagnostic_error, transform_fault, clocks_apart, slow_chain, or (INFO) unmatched_publisher, unmatched_subscription, \
      restamping_node, buffers_by_cpu.",
 )
 .resolved_severity(Severity::Info);

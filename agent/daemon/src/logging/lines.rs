@@ -136,7 +136,7 @@ mod tests {
         }
         // Only the first line waits.
         assert!(
-            began.elapsed() < Duration::from_secs(2),
+            began.elapsed() < Duration::from_secs(30),
             "{:?}",
             began.elapsed()
         );

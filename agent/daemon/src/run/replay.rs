@@ -121,6 +121,7 @@ impl Packets {
     /// Opens a capture or a bag.
     fn open(path: &Path, expansion: Expansion) -> Result<Self, ReplayError> {
         if messages::is_bag(path) {
+            messages::check(path).map_err(BagError::from)?;
             return Ok(Self::Bag(BagReader::open(path, expansion)));
         }
         let reader = PcapReader::open(path, expansion)?;

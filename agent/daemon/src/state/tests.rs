@@ -194,7 +194,7 @@ fn a_pipe_or_directory_instead_of_a_state_file_does_not_block_the_start() {
     mknodat(CWD, &path, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0).unwrap();
     let (found, received) = std::sync::mpsc::channel();
     std::thread::spawn(move || found.send((unusable(&directory), directory)));
-    let (reason, directory) = received.recv_timeout(Duration::from_secs(10)).unwrap();
+    let (reason, directory) = received.recv_timeout(Duration::from_secs(60)).unwrap();
     assert_eq!(reason, "not a regular file");
     let aside = place.path().join("discovery.json.corrupt");
     let error = StateDirectory::open(&aside).unwrap_err();
@@ -224,7 +224,7 @@ fn a_failed_write_of_the_state_is_counted_and_retried() {
     assert!(keeper.is_write_due(0, start));
     keeper.keep(Memory::default(), 0, start);
     while keeper.facts().failures == 0 {
-        assert!(start.elapsed() < Duration::from_secs(10));
+        assert!(start.elapsed() < Duration::from_secs(60));
         std::thread::yield_now();
     }
     fs::remove_dir(obstacle).unwrap();
@@ -261,7 +261,7 @@ fn a_hanging_file_system_delays_neither_the_agent_nor_its_end() {
     }
     let began = Instant::now();
     assert!(!keeper.finish_until(Memory::default(), began + Duration::from_millis(100)));
-    assert!(began.elapsed() < Duration::from_secs(5));
+    assert!(began.elapsed() < Duration::from_secs(60));
     drop(answer);
 }
 

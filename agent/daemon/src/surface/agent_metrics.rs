@@ -138,6 +138,10 @@ pub(super) fn model(
         snapshot.map_or(0, |snapshot| snapshot.datagrams),
     )?;
     sink.single(
+        &metric::TLS_CONNECTIONS,
+        snapshot.map_or(0, |snapshot| snapshot.tls_connections),
+    )?;
+    sink.single(
         &metric::RECORDS,
         snapshot.map_or(0, |snapshot| snapshot.records),
     )?;

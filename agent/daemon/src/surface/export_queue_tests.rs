@@ -27,10 +27,11 @@ use crate::surface::export_tests::start_with;
 /// Header that each request must have, also the first one after a start.
 const TOKEN: &str = "x-robot-token";
 
-/// A receiver of logs, which answers with these failures before it accepts requests.
+/// A receiver of logs, which gives these answers before it accepts requests.
 #[derive(Clone, Default)]
 struct Receiver {
-    failures: Arc<Mutex<VecDeque<Status>>>,
+    /// Failures; `None` accepts a request.
+    answers: Arc<Mutex<VecDeque<Option<Status>>>>,
     /// Numbers in the events that it accepted.
     numbers: Arc<Mutex<Vec<i64>>>,
 }
@@ -47,7 +48,7 @@ impl LogsService for Receiver {
         }
         let numbers = numbers(request.get_ref());
         if !numbers.is_empty()
-            && let Some(failure) = self.failures.lock().unwrap().pop_front()
+            && let Some(Some(failure)) = self.answers.lock().unwrap().pop_front()
         {
             return Err(failure);
         }
@@ -58,8 +59,14 @@ impl LogsService for Receiver {
 
 impl Receiver {
     async fn serve(self, address: SocketAddr) {
+        self.serve_up_to(usize::MAX, address).await;
+    }
+
+    /// Accepts requests up to a size in bytes.
+    async fn serve_up_to(self, size: usize, address: SocketAddr) {
         let listener = TcpListener::bind(address).await.unwrap();
-        let server = Server::builder().add_service(LogsServiceServer::new(self));
+        let service = LogsServiceServer::new(self).max_decoding_message_size(size);
+        let server = Server::builder().add_service(service);
         tokio::spawn(server.serve_with_incoming(TcpIncoming::from(listener)));
     }
 
@@ -156,9 +163,13 @@ async fn events_of_an_outage_survive_ends_of_the_agent_and_arrive_once_in_order(
 
     let receiver = Receiver::default();
     let details = "when to try again".into();
-    receiver.failures.lock().unwrap().extend([
-        Status::unavailable("so said the test"),
-        Status::with_details(Code::ResourceExhausted, "busy", details),
+    receiver.answers.lock().unwrap().extend([
+        Some(Status::unavailable("so said the test")),
+        Some(Status::with_details(
+            Code::ResourceExhausted,
+            "busy",
+            details,
+        )),
     ]);
     receiver.clone().serve(address).await;
     let third = Exporting::start(address, directory.path());
@@ -189,7 +200,7 @@ async fn a_refused_request_leaves_the_queue_and_is_counted_and_later_ones_follow
     let refused = agent.events.last();
     let receiver = Receiver::default();
     let refusal = Status::invalid_argument("so said the test");
-    receiver.failures.lock().unwrap().push_back(refusal);
+    receiver.answers.lock().unwrap().push_back(Some(refusal));
     receiver.clone().serve(address).await;
     agent.until("no queue", |exports| bytes(exports) == 0).await;
     agent.record(11..=20);
@@ -223,5 +234,65 @@ async fn events_wait_in_memory_where_they_cannot_be_written() {
         .await;
     assert_eq!(receiver.numbers(), (1..=10).collect::<Vec<_>>());
     assert_eq!((agent.dropped(), bytes(&agent.exports)), (0, 0));
+    agent.thread.finish().await;
+}
+
+/// Size of a request with a few events, in bytes.
+const SIZE: usize = 450;
+
+#[tokio::test]
+async fn parts_of_a_request_on_disk_are_delivered_once_also_across_a_restart() {
+    let directory = tempfile::tempdir().unwrap();
+    let address = silent("127.17.41.5").await;
+    let first = Exporting::start(address, directory.path());
+    first.record(1..=30);
+    first.until("a queue", |exports| bytes(exports) > 0).await;
+    let receiver = Receiver::default();
+    // The link breaks after three parts.
+    let broken = || Some(Status::unavailable("so said the test"));
+    let answers = [None, None, None].into_iter();
+    let answers = answers.chain((0..100).map(|_| broken()));
+    receiver.answers.lock().unwrap().extend(answers);
+    receiver.clone().serve_up_to(SIZE, address).await;
+    first
+        .until("a broken link", |_| {
+            receiver.answers.lock().unwrap().len() < 100
+        })
+        .await;
+    let parts = receiver.numbers().len();
+    assert!((3..30).contains(&parts), "{parts}");
+    first.thread.finish().await;
+
+    receiver.answers.lock().unwrap().clear();
+    let second = Exporting::start(address, directory.path());
+    second.record(31..=40);
+    second
+        .until("all events", |_| receiver.numbers().len() >= 40)
+        .await;
+    second
+        .until("no queue", |exports| bytes(exports) == 0)
+        .await;
+    assert_eq!(receiver.numbers(), (1..=40).collect::<Vec<_>>());
+    assert_eq!(second.dropped(), 0);
+    second.thread.finish().await;
+}
+
+#[tokio::test]
+async fn an_event_that_fits_no_request_leaves_the_queue_and_is_counted_and_later_ones_follow() {
+    let directory = tempfile::tempdir().unwrap();
+    let address = silent("127.17.41.6").await;
+    let agent = Exporting::start(address, directory.path());
+    agent.record(1..=10);
+    let (what, count) = ("x".repeat(SIZE).leak(), 11);
+    agent.events.record(AgentEvent::Dropped { what, count });
+    agent.record(12..=20);
+    agent.until("a queue", |exports| bytes(exports) > 0).await;
+    let receiver = Receiver::default();
+    receiver.clone().serve_up_to(SIZE, address).await;
+    agent.until("no queue", |exports| bytes(exports) == 0).await;
+    let expected: Vec<_> = (1..=20).filter(|number| *number != 11).collect();
+    assert_eq!(receiver.numbers(), expected);
+    let too_large = agent.exports.dropped(Signal::Events, Reason::TooLarge);
+    assert_eq!((too_large, agent.dropped()), (1, 1));
     agent.thread.finish().await;
 }

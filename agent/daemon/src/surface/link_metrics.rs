@@ -42,6 +42,15 @@ pub(super) fn links(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::Resu
             })
         })?;
     }
+    sink.family(&metric::LINK_UNSENT, |family| {
+        links.iter().try_for_each(|(facts, source, destination)| {
+            let labels = labels(facts.key.protocol.label(), source, destination);
+            match facts.unsent {
+                Some(bytes) => family.sample(&labels, bytes),
+                None => Ok(()),
+            }
+        })
+    })?;
     sink.family(&metric::LINK_ROUND_TRIP, |family| {
         links.iter().try_for_each(|(facts, source, destination)| {
             let labels = labels(facts.key.protocol.label(), source, destination);

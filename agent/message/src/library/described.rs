@@ -120,6 +120,17 @@ impl TypeSource {
             Self::Description(bytes) | Self::TypeObjects(bytes) => bytes,
         }
     }
+
+    /// Returns whether both have the same types. Each node requests each type, and the replies
+    /// differ in the identities of the requests.
+    fn has_content_of(&self, other: &Self) -> bool {
+        match (self, other) {
+            (Self::TypeObjects(one), Self::TypeObjects(other)) => {
+                type_object::without_request(one) == type_object::without_request(other)
+            }
+            _ => self == other,
+        }
+    }
 }
 
 impl Described {
@@ -136,7 +147,13 @@ impl Described {
                 waiting.refused_objects += 1;
                 return;
             }
-            _ if waiting.sources.contains(&source) => return,
+            _ if waiting
+                .sources
+                .iter()
+                .any(|kept| kept.has_content_of(&source)) =>
+            {
+                return;
+            }
             _ => {}
         }
         waiting.bytes += length;

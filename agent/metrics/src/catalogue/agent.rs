@@ -126,6 +126,12 @@ pub const DATAGRAMS: Metric = Metric::counter(
     &[],
     "Datagrams parsed in user space.",
 );
+pub const TLS_CONNECTIONS: Metric = Metric::counter(
+    "ros2probe_rtps_tcp_tls_connections_total",
+    &[],
+    "TCP connections with TLS to addresses that participants announce; nothing in them is read.",
+)
+.experimental();
 pub const RECORDS: Metric =
     Metric::counter("ros2probe_records_total", &[], "Measurement records read.");
 pub const DECODE_ERRORS: Metric = Metric::counter(
@@ -254,8 +260,8 @@ pub const OTLP_DROPPED: Metric = Metric::counter(
     "ros2probe_otlp_dropped_total",
     &["signal", "reason"],
     "Data points, log records and spans that were not delivered: overflow (queue full), \
-     superseded (by newer points), refused, rejected (in part) or \
-     shutdown.",
+     superseded (by newer points), refused, rejected (in part), too_large \
+     or shutdown.",
 );
 pub const OTLP_QUEUE: Metric = Metric::gauge(
     "ros2probe_otlp_queue_bytes",

@@ -36,3 +36,10 @@ pub const LINK_UNACKNOWLEDGED: Metric = Metric::gauge(
 )
 .unit("bytes")
 .experimental();
+pub const LINK_UNSENT: Metric = Metric::gauge(
+    "ros2_link_unsent_bytes",
+    LINK,
+    "Bytes that were written and that the kernel has not sent yet.",
+)
+.unit("bytes")
+.experimental();

@@ -15,7 +15,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::exports::{Exports, Outcome, Reason, Signal};
 use super::kept::{Kept, KeptRequest};
-use super::reports::Report;
+use super::reports::{Failure, Report, unreported_failure};
 
 /// Time for the last batches, of the two seconds for stopping.
 pub(super) const LAST_BATCH_TIMEOUT: Duration = Duration::from_millis(1_400);
@@ -39,6 +39,13 @@ pub(super) trait Persist: Export {
 
     /// Sends such a request once.
     async fn export_encoded(&self, request: &[u8]) -> OTelSdkResult;
+
+    /// Returns such a request as two: the first `place` items, and the others; `None` if it cannot
+    /// be read.
+    fn divided(request: &[u8], place: u64) -> Option<[Vec<u8>; 2]>;
+
+    /// Returns such a request without items, which is about as long as another one.
+    fn padded(request: &[u8]) -> Vec<u8>;
 }
 
 /// Items that wait for the exporter.
@@ -65,6 +72,8 @@ pub(super) struct Delivery<E> {
     stop: CancellationToken,
     /// Whether the last request succeeded; `None` before the first.
     is_working: Cell<Option<bool>>,
+    /// Whether the log has a line about an item that is too large.
+    has_logged_large: Cell<bool>,
 }
 
 /// Pauses before a batch is offered again: each is twice as long as the one before it.
@@ -94,6 +103,10 @@ pub(super) enum Attempt {
     Settled,
     /// They must be offered again.
     Unsettled,
+    /// The same, since no answer came in time.
+    TimedOut,
+    /// The receiver does not accept requests of this size.
+    TooLarge,
 }
 
 /// Result of the delivery of a batch.
@@ -123,6 +136,7 @@ impl<E: Export> Delivery<E> {
             exports,
             stop,
             is_working: Cell::new(None),
+            has_logged_large: Cell::new(false),
         }
     }
 
@@ -186,44 +200,46 @@ impl<E: Export> Delivery<E> {
     /// Offers a batch until the receiver accepts or refuses it.
     async fn send_until_settled(&self, batch: &E::Batch) {
         let (mut pauses, mut is_again) = (Pauses::default(), false);
-        while self.offer(batch, is_again).await == Attempt::Unsettled {
+        while self.offer(batch, is_again).await != Attempt::Settled {
             is_again = true;
             sleep(pauses.next()).await;
         }
     }
 
     /// Offers a batch once. `is_again`: this batch was offered before.
-    pub(super) async fn offer(&self, batch: &E::Batch, is_again: bool) -> Attempt {
-        let export = self.exporter.export(batch);
-        self.attempt(export, E::items(batch), is_again).await
-    }
-
-    /// Runs an export of this number of items, and counts a refusal.
-    async fn attempt(
-        &self,
-        export: impl Future<Output = OTelSdkResult>,
-        items: u64,
-        is_again: bool,
-    ) -> Attempt {
-        let Err((error, is_refused)) = self.send(export, is_again).await else {
+    async fn offer(&self, batch: &E::Batch, is_again: bool) -> Attempt {
+        let Err((error, failure)) = self.send(self.exporter.export(batch), is_again).await else {
             return Attempt::Settled;
         };
-        self.failed(&error);
-        if !is_refused {
-            return Attempt::Unsettled;
-        }
-        self.count(Outcome::Failed);
-        self.drop(Reason::Refused, items);
-        Attempt::Settled
+        // A batch of this kind is not divided: the next one has newer points.
+        let failure = match failure {
+            Failure::TooLarge => Failure::Refused,
+            failure => failure,
+        };
+        self.settle(&error, failure, E::items(batch))
     }
 
-    /// Runs an export and counts a success. An error includes whether the receiver refuses the
-    /// items.
+    /// Counts a refusal of this number of items.
+    fn settle(&self, error: &str, failure: Failure, items: u64) -> Attempt {
+        self.failed(error);
+        match failure {
+            Failure::Temporary => Attempt::Unsettled,
+            Failure::TimedOut => Attempt::TimedOut,
+            Failure::TooLarge => Attempt::TooLarge,
+            Failure::Refused => {
+                self.count(Outcome::Failed);
+                self.drop(Reason::Refused, items);
+                Attempt::Settled
+            }
+        }
+    }
+
+    /// Runs an export and counts a success.
     async fn send(
         &self,
         export: impl Future<Output = OTelSdkResult>,
         is_again: bool,
-    ) -> Result<(), (String, bool)> {
+    ) -> Result<(), (String, Failure)> {
         let report = Report::new(self.signal, Arc::clone(&self.exports), is_again);
         let (result, report) = report.of(export).await;
         match result {
@@ -236,8 +252,11 @@ impl<E: Export> Delivery<E> {
                     OTelSdkError::InternalFailure(reason) => reason,
                     other => other.to_string(),
                 };
-                let is_refused = report.is_refused() && !is_of_connection(&error);
-                Err((error, is_refused))
+                let failure = match report.failure() {
+                    Failure::Refused if is_of_connection(&error) => Failure::Temporary,
+                    failure => failure,
+                };
+                Err((error, failure))
             }
         }
     }
@@ -287,10 +306,56 @@ impl<E: Persist> Delivery<E> {
         Kept::open(directory, limit, self.signal, &self.exports)
     }
 
-    /// Offers a request that waited on disk. `is_again`: this process offered it before.
-    pub(super) async fn offer_kept(&self, request: &KeptRequest, is_again: bool) -> Attempt {
+    /// Offers a batch for the first time. Only the answer to its encoded form shows whether it is
+    /// too large.
+    pub(super) async fn offer_first(&self, batch: &E::Batch) -> Attempt {
+        let Err((error, failure)) = self.send(self.exporter.export(batch), false).await else {
+            return Attempt::Settled;
+        };
+        let failure = match failure {
+            Failure::Refused if may_be_too_large(&error) => Failure::Temporary,
+            failure => failure,
+        };
+        self.settle(&error, failure, E::items(batch))
+    }
+
+    /// Offers an encoded request once. `is_again`: this process offered its items before.
+    pub(super) async fn offer_encoded(&self, request: &KeptRequest, is_again: bool) -> Attempt {
         let export = self.exporter.export_encoded(&request.encoded);
-        self.attempt(export, request.items, is_again).await
+        let Err((error, failure)) = self.send(export, is_again).await else {
+            return Attempt::Settled;
+        };
+        self.settle(&error, failure, request.items)
+    }
+
+    /// Returns whether a single item does not fit the link: the receiver answers a request without
+    /// items in time, but not one that is padded to the length of this one.
+    pub(super) async fn is_too_long(&self, request: &KeptRequest) -> bool {
+        let offer = async |like: &[u8]| {
+            let request = E::padded(like);
+            unreported_failure(self.exporter.export_encoded(&request)).await
+        };
+        let (empty, failure) = offer(&[]).await;
+        // A refusal is an answer in time.
+        if empty.is_err() && failure != Failure::Refused {
+            return false;
+        }
+        let (padded, failure) = offer(&request.encoded).await;
+        padded.is_err() && failure == Failure::TimedOut
+    }
+
+    /// Counts an item that no request can deliver, and logs the first one.
+    pub(super) fn drop_too_large(&self, request: &KeptRequest) {
+        self.count(Outcome::Failed);
+        self.drop(Reason::TooLarge, request.items);
+        if !self.has_logged_large.replace(true) {
+            tracing::warn!(
+                signal = self.signal.label(),
+                endpoint = self.endpoint,
+                bytes = request.encoded.len(),
+                "an item is too large for the OTLP receiver or the link: it is dropped"
+            );
+        }
     }
 
     /// Returns the request for these items, which can wait on disk.
@@ -298,6 +363,7 @@ impl<E: Persist> Delivery<E> {
         KeptRequest {
             items: E::items(batch),
             encoded: self.exporter.encode(batch),
+            settled: 0,
         }
     }
 }
@@ -308,4 +374,14 @@ impl<E: Persist> Delivery<E> {
 fn is_of_connection(error: &str) -> bool {
     let after = error.split_once("gRPC code: ");
     after.is_some_and(|(_, after)| after.contains(": "))
+}
+
+/// Returns whether the receiver, or a proxy before it, may have refused a request of the library for
+/// its size. The library does not return the status of HTTP that a proxy answers a gRPC request with.
+fn may_be_too_large(error: &str) -> bool {
+    let is_of_proxy = error.ends_with("gRPC code: Unknown");
+    let is_of_receiver = ["gRPC code: ResourceExhausted", "status code: 413"]
+        .iter()
+        .any(|part| error.contains(part));
+    is_of_proxy || is_of_receiver
 }

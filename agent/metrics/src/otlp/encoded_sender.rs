@@ -18,16 +18,21 @@ use opentelemetry_proto::tonic::collector::trace::v1::trace_service_client::Trac
 use opentelemetry_proto::tonic::collector::trace::v1::{
     ExportTraceServiceRequest, ExportTraceServiceResponse,
 };
+use opentelemetry_proto::tonic::common::v1::{AnyValue, KeyValue, any_value};
+use opentelemetry_proto::tonic::logs::v1::ResourceLogs;
+use opentelemetry_proto::tonic::resource::v1::Resource;
+use opentelemetry_proto::tonic::trace::v1::ResourceSpans;
 use opentelemetry_sdk::error::{OTelSdkError, OTelSdkResult};
 use prost::Message;
+use tokio::time::error::Elapsed;
 use tonic::codec::CompressionEncoding;
 use tonic::codegen::http::Uri;
 use tonic::codegen::http::header::CONTENT_ENCODING;
 use tonic::metadata::MetadataMap;
 use tonic::transport::Channel;
-use tonic::{Code, Status};
+use tonic::{Code, Status, TimeoutExpired};
 
-use super::reports;
+use super::reports::{self, Failure};
 use super::transport::SentHeaders;
 
 /// A service of OTLP, as the type of its requests.
@@ -90,6 +95,85 @@ service!(
     rejected_spans
 );
 
+/// Requests with items that may be sent in parts.
+pub(super) trait Divisible: Service {
+    /// Removes the items from this place on, and returns them as a request.
+    fn split_off(&mut self, place: usize) -> Self;
+
+    /// Returns a request without items, whose resource has these bytes.
+    fn padded(padding: Vec<u8>) -> Self;
+}
+
+macro_rules! divisible {
+    ($request:ident, $group:ident, $groups:ident, $scopes:ident, $items:ident) => {
+        impl Divisible for $request {
+            fn split_off(&mut self, mut place: usize) -> Self {
+                let mut rest = Self::default();
+                for mut group in std::mem::take(&mut self.$groups) {
+                    let scopes = std::mem::take(&mut group.$scopes);
+                    let mut after = group.clone();
+                    for mut scope in scopes {
+                        let mut items = std::mem::take(&mut scope.$items);
+                        let later = items.split_off(place.min(items.len()));
+                        place -= items.len();
+                        if !later.is_empty() {
+                            let mut scope = scope.clone();
+                            scope.$items = later;
+                            after.$scopes.push(scope);
+                        }
+                        if !items.is_empty() {
+                            scope.$items = items;
+                            group.$scopes.push(scope);
+                        }
+                    }
+                    if !group.$scopes.is_empty() {
+                        self.$groups.push(group);
+                    }
+                    if !after.$scopes.is_empty() {
+                        rest.$groups.push(after);
+                    }
+                }
+                rest
+            }
+
+            fn padded(padding: Vec<u8>) -> Self {
+                let value = Some(any_value::Value::BytesValue(padding));
+                let attribute = KeyValue {
+                    key: "padding".to_owned(),
+                    value: Some(AnyValue { value }),
+                    ..KeyValue::default()
+                };
+                let resource = Resource {
+                    attributes: vec![attribute],
+                    ..Resource::default()
+                };
+                let group = $group {
+                    resource: Some(resource),
+                    ..$group::default()
+                };
+                Self {
+                    $groups: vec![group],
+                }
+            }
+        }
+    };
+}
+
+divisible!(
+    ExportLogsServiceRequest,
+    ResourceLogs,
+    resource_logs,
+    scope_logs,
+    log_records
+);
+divisible!(
+    ExportTraceServiceRequest,
+    ResourceSpans,
+    resource_spans,
+    scope_spans,
+    spans
+);
+
 /// Sends such requests.
 pub(super) struct EncodedSender {
     protocol: Protocol,
@@ -132,9 +216,25 @@ impl EncodedSender {
             Ok(request) => self.send(&request).await,
             Err(error) => {
                 // Another version of the agent wrote it.
-                reports::refused();
+                reports::failed(Failure::Refused);
                 failure(error.to_string())
             }
+        }
+    }
+
+    /// Returns the request with these bytes as two: the first `place` items, and the others; `None`
+    /// if it cannot be read.
+    pub(super) fn divided<S: Divisible>(request: &[u8], place: u64) -> Option<[Vec<u8>; 2]> {
+        let mut first = S::decode(request).ok()?;
+        let second = first.split_off(usize::try_from(place).ok()?);
+        Some([first.encode_to_vec(), second.encode_to_vec()])
+    }
+
+    /// Returns a request without items that is about as long as another one.
+    pub(super) fn padded<S: Divisible>(request: &[u8]) -> Vec<u8> {
+        match request {
+            [] => Vec::new(),
+            request => S::padded(request.to_vec()).encode_to_vec(),
         }
     }
 
@@ -155,9 +255,7 @@ impl EncodedSender {
                 match S::call(channel.clone(), *gzip, request).await {
                     Ok(response) => response,
                     Err(status) => {
-                        if is_final(&status) {
-                            reports::refused();
-                        }
+                        reports::failed(failure_of(&status));
                         let code = format!("export failed with gRPC code: {:?}", status.code());
                         let source = std::error::Error::source(&status);
                         return failure(match source {
@@ -181,11 +279,18 @@ impl EncodedSender {
                 *request.headers_mut() = headers;
                 let response = match client.send_bytes(request).await {
                     Ok(response) => response,
-                    Err(error) => return failure(error.to_string()),
+                    Err(error) => {
+                        if error.is::<Elapsed>() {
+                            reports::failed(Failure::TimedOut);
+                        }
+                        return failure(error.to_string());
+                    }
                 };
                 if !response.status().is_success() {
-                    if ![429, 502, 503, 504].contains(&response.status().as_u16()) {
-                        reports::refused();
+                    match response.status().as_u16() {
+                        429 | 502 | 503 | 504 => {}
+                        413 => reports::failed(Failure::TooLarge),
+                        _ => reports::failed(Failure::Refused),
                     }
                     return failure(format!("export failed with status {}", response.status()));
                 }
@@ -205,18 +310,69 @@ fn failure(reason: String) -> OTelSdkResult {
     Err(OTelSdkError::InternalFailure(reason))
 }
 
-/// Returns whether a request must not be repeated (OTLP 1.x, "Failures").
-fn is_final(status: &Status) -> bool {
+/// Returns why a request failed, and with it whether it may be repeated (OTLP 1.x, "Failures").
+fn failure_of(status: &Status) -> Failure {
     match status.code() {
+        Code::ResourceExhausted | Code::OutOfRange if is_of_size(status.message()) => {
+            Failure::TooLarge
+        }
+        // A proxy refused the request before the receiver.
+        Code::Unknown if status.message().ends_with(" HTTP status code 413") => Failure::TooLarge,
+        Code::Cancelled if status.message() == TimeoutExpired(()).to_string() => Failure::TimedOut,
         Code::Cancelled
         | Code::DeadlineExceeded
         | Code::Aborted
         | Code::OutOfRange
         | Code::Unavailable
-        | Code::DataLoss => false,
-        // Details mean that the receiver is busy, and when to try again. Without them, the request
-        // is too large.
-        Code::ResourceExhausted => status.details().is_empty(),
-        _ => true,
+        | Code::DataLoss => Failure::Temporary,
+        // Details mean that the receiver is busy, and when to try again.
+        Code::ResourceExhausted if !status.details().is_empty() => Failure::Temporary,
+        _ => Failure::Refused,
+    }
+}
+
+/// Returns whether the receiver says that a message is too large. The texts are those of gRPC for
+/// Go, Java and C++, and of tonic.
+fn is_of_size(message: &str) -> bool {
+    let parts = [
+        "larger than max",
+        "exceeds maximum size",
+        "length too large",
+    ];
+    let message = message.to_ascii_lowercase();
+    parts.iter().any(|part| message.contains(part))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_answer_about_the_size_is_no_refusal_of_the_items() {
+        let failure = |code, message: &str| failure_of(&Status::new(code, message));
+        for message in [
+            "grpc: received message larger than max (5000000 vs. 4194304)",
+            "gRPC message exceeds maximum size 4194304: 5000000",
+            "Received message larger than max (5000000 vs. 4194304)",
+        ] {
+            assert_eq!(failure(Code::ResourceExhausted, message), Failure::TooLarge);
+        }
+        let of_proxy = "grpc-status header missing, mapped from HTTP status code 413";
+        assert_eq!(failure(Code::Unknown, of_proxy), Failure::TooLarge);
+        let of_tonic = "Error, decoded message length too large: found 9 bytes, the limit is: 8";
+        assert_eq!(failure(Code::OutOfRange, of_tonic), Failure::TooLarge);
+        for (code, message, expected) in [
+            (Code::ResourceExhausted, "quota", Failure::Refused),
+            (Code::OutOfRange, "", Failure::Temporary),
+            (Code::Unknown, "HTTP status code 418", Failure::Refused),
+            (Code::Cancelled, "Timeout expired", Failure::TimedOut),
+            (Code::Cancelled, "", Failure::Temporary),
+            (Code::DeadlineExceeded, "", Failure::Temporary),
+            (Code::InvalidArgument, "length too large", Failure::Refused),
+        ] {
+            assert_eq!(failure(code, message), expected, "{code:?} {message}");
+        }
+        let busy = Status::with_details(Code::ResourceExhausted, "", vec![1].into());
+        assert_eq!(failure_of(&busy), Failure::Temporary);
     }
 }

@@ -74,6 +74,14 @@ impl Persist for LogExport {
             .send_encoded::<ExportLogsServiceRequest>(request)
             .await
     }
+
+    fn divided(request: &[u8], place: u64) -> Option<[Vec<u8>; 2]> {
+        EncodedSender::divided::<ExportLogsServiceRequest>(request, place)
+    }
+
+    fn padded(request: &[u8]) -> Vec<u8> {
+        EncodedSender::padded::<ExportLogsServiceRequest>(request)
+    }
 }
 
 /// Exports the event log.

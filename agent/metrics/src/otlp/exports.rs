@@ -42,6 +42,8 @@ pub enum Reason {
     Refused,
     /// The receiver rejected these items and accepted the others.
     Rejected,
+    /// The receiver or the link does not take a single item of this size.
+    TooLarge,
     /// The agent stopped first.
     Shutdown,
 }
@@ -96,11 +98,12 @@ impl Outcome {
 
 impl Reason {
     /// All reasons.
-    pub const ALL: [Self; 5] = [
+    pub const ALL: [Self; 6] = [
         Self::Overflow,
         Self::Superseded,
         Self::Refused,
         Self::Rejected,
+        Self::TooLarge,
         Self::Shutdown,
     ];
 
@@ -112,6 +115,7 @@ impl Reason {
             Self::Superseded => "superseded",
             Self::Refused => "refused",
             Self::Rejected => "rejected",
+            Self::TooLarge => "too_large",
             Self::Shutdown => "shutdown",
         }
     }

@@ -9,7 +9,7 @@ use ros2probe_history::{Queue, Record};
 use super::exports::{Exports, Reason, Signal};
 
 /// Requests below this size are sent together, in bytes.
-const REQUEST_BYTES: usize = 64 << 10;
+pub(super) const REQUEST_BYTES: usize = 64 << 10;
 /// Length of the number of items, which precedes each request on disk, in bytes.
 const ITEMS_LEN: usize = size_of::<u32>();
 
@@ -24,6 +24,9 @@ pub(super) struct Kept {
     can_read: bool,
     /// File of the oldest request that was read.
     file: u32,
+    /// Number of items in the request that was read, and whether it is one record of the queue.
+    items: u64,
+    is_single: bool,
 }
 
 /// A request that waits.
@@ -33,6 +36,8 @@ pub(super) struct KeptRequest {
     pub(super) items: u64,
     /// The request in the form of the protocol.
     pub(super) encoded: Vec<u8>,
+    /// Number of its first items that are settled: they are not part of `items`.
+    pub(super) settled: u64,
 }
 
 impl Kept {
@@ -59,6 +64,8 @@ impl Kept {
             can_write: true,
             can_read: true,
             file: 0,
+            items: 0,
+            is_single: false,
         };
         kept.show_size();
         Some(kept)
@@ -93,8 +100,9 @@ impl Kept {
         appended.is_ok()
     }
 
-    /// Returns the next requests as one; `None` after the last one, or if it cannot be read now.
-    pub(super) fn read(&mut self) -> Option<KeptRequest> {
+    /// Returns the next requests as one of about this size; `None` after the last one, or if it
+    /// cannot be read now.
+    pub(super) fn read(&mut self, size: usize) -> Option<KeptRequest> {
         let Some(mut all) = self.read_one() else {
             // No record that is left can be read. Later ones must not follow it.
             if self.can_read && !self.queue.is_empty() {
@@ -104,12 +112,32 @@ impl Kept {
             return None;
         };
         self.file = self.queue.file_of_read();
-        while all.encoded.len() < REQUEST_BYTES
+        self.is_single = true;
+        while all.encoded.len() < size
+            && all.settled == 0
             && let Some(more) = self.read_one()
         {
+            self.is_single = false;
             all.append(more);
         }
+        self.items = all.settled + all.items;
         Some(all)
+    }
+
+    /// Returns whether the request that was read is one record. Only parts of such a one can be
+    /// noted as settled.
+    pub(super) const fn is_single(&self) -> bool {
+        self.is_single
+    }
+
+    /// Reads the requests that were read once more.
+    pub(super) fn rewind(&mut self) {
+        self.queue.rewind();
+    }
+
+    /// Notes that all items but the last `left` of the record that was read are settled.
+    pub(super) fn settle_but(&mut self, left: u64) {
+        self.queue.settle(self.items.saturating_sub(left));
     }
 
     /// Returns whether the requests that were read are still on disk: a full queue may lose them.
@@ -158,10 +186,12 @@ impl KeptRequest {
             return None;
         }
         let (items, encoded) = record.content.split_at_checked(ITEMS_LEN)?;
-        let items = u32::from_le_bytes(items.try_into().ok()?);
+        let items: u64 = u32::from_le_bytes(items.try_into().ok()?).into();
+        let settled = record.settled.min(items);
         Some(Self {
-            items: items.into(),
+            items: items - settled,
             encoded: encoded.to_vec(),
+            settled,
         })
     }
 }
@@ -194,6 +224,7 @@ mod tests {
         KeptRequest {
             items,
             encoded: bytes.collect(),
+            settled: 0,
         }
     }
 
@@ -204,15 +235,15 @@ mod tests {
         for items in 1..=3 {
             assert!(kept.append(&request(items, REQUEST_BYTES)));
         }
-        assert_eq!(kept.read(), Some(request(1, REQUEST_BYTES)));
+        assert_eq!(kept.read(REQUEST_BYTES), Some(request(1, REQUEST_BYTES)));
         kept.remove();
-        assert_eq!(kept.read(), Some(request(2, REQUEST_BYTES)));
+        assert_eq!(kept.read(REQUEST_BYTES), Some(request(2, REQUEST_BYTES)));
         assert!(exports.queue_bytes(Signal::Events) > 100_000);
         let (mut kept, exports) = opened(directory.path(), LIMIT);
         assert!(exports.queue_bytes(Signal::Events) > 100_000);
-        assert_eq!(kept.read(), Some(request(2, REQUEST_BYTES)));
-        assert_eq!(kept.read(), Some(request(3, REQUEST_BYTES)));
-        assert_eq!(kept.read(), None);
+        assert_eq!(kept.read(REQUEST_BYTES), Some(request(2, REQUEST_BYTES)));
+        assert_eq!(kept.read(REQUEST_BYTES), Some(request(3, REQUEST_BYTES)));
+        assert_eq!(kept.read(REQUEST_BYTES), None);
         kept.remove();
         assert!(kept.is_empty());
         assert_eq!(exports.queue_bytes(Signal::Events), 0);
@@ -227,9 +258,35 @@ mod tests {
         }
         let mut first = request(1, REQUEST_BYTES / 2);
         first.append(request(2, REQUEST_BYTES / 2));
-        assert_eq!(kept.read(), Some(first));
+        assert_eq!(kept.read(REQUEST_BYTES), Some(first));
         kept.remove();
-        assert_eq!(kept.read(), Some(request(3, REQUEST_BYTES / 2)));
+        assert_eq!(
+            kept.read(REQUEST_BYTES),
+            Some(request(3, REQUEST_BYTES / 2))
+        );
+    }
+
+    #[test]
+    fn the_settled_part_of_a_request_is_neither_sent_with_others_nor_counted_as_lost() {
+        let directory = tempfile::tempdir().unwrap();
+        let (mut kept, _) = opened(directory.path(), LIMIT);
+        for items in [9, 2] {
+            assert!(kept.append(&request(items, 1_000)));
+        }
+        assert_eq!(kept.read(REQUEST_BYTES).unwrap().items, 11);
+        assert!(!kept.is_single());
+        kept.rewind();
+        assert_eq!(kept.read(500), Some(request(9, 1_000)));
+        assert!(kept.is_single());
+        kept.settle_but(5);
+        let (mut kept, _) = opened(directory.path(), LIMIT);
+        let rest = kept.read(REQUEST_BYTES).unwrap();
+        assert_eq!((rest.items, rest.settled), (5, 4));
+        let (mut kept, exports) = opened(directory.path(), LIMIT);
+        for _ in 0..200 {
+            assert!(kept.append(&request(0, 10_000)));
+        }
+        assert_eq!(exports.dropped(Signal::Events, Reason::Overflow), 5 + 2);
     }
 
     #[test]
@@ -238,7 +295,7 @@ mod tests {
         let (mut kept, exports) = opened(directory.path(), LIMIT);
         let in_flight = {
             assert!(kept.append(&request(9, REQUEST_BYTES)));
-            kept.read().unwrap()
+            kept.read(REQUEST_BYTES).unwrap()
         };
         assert!(kept.has_read());
         for _ in 0..200 {
@@ -247,7 +304,7 @@ mod tests {
         assert!(exports.queue_bytes(Signal::Events) <= LIMIT);
         // The request in flight is lost, too, and its delivery counts it.
         assert!(in_flight.items == 9 && !kept.has_read());
-        let left: u64 = std::iter::from_fn(|| kept.read())
+        let left: u64 = std::iter::from_fn(|| kept.read(REQUEST_BYTES))
             .map(|request| request.items)
             .sum();
         let lost = exports.dropped(Signal::Events, Reason::Overflow);
@@ -264,9 +321,9 @@ mod tests {
         let mut bytes = std::fs::read(&file).unwrap();
         bytes[30..40].fill(0xff);
         std::fs::write(&file, bytes).unwrap();
-        assert_eq!(kept.read(), None);
+        assert_eq!(kept.read(REQUEST_BYTES), None);
         assert!(kept.append(&request(2, 1_000)));
-        assert_eq!(kept.read(), Some(request(2, 1_000)));
+        assert_eq!(kept.read(REQUEST_BYTES), Some(request(2, 1_000)));
         kept.remove();
         assert!(kept.is_empty());
     }
@@ -280,7 +337,7 @@ mod tests {
         let (mut kept, exports) = opened(&directory.path().join("file"), LIMIT);
         std::fs::write(directory.path().join("file"), "").unwrap();
         assert!(!kept.append(&request(3, 10)));
-        assert!(kept.is_empty() && kept.read().is_none());
+        assert!(kept.is_empty() && kept.read(REQUEST_BYTES).is_none());
         assert_eq!(exports.dropped(Signal::Events, Reason::Overflow), 0);
     }
 }

@@ -17,6 +17,7 @@ mod metrics;
 mod naming;
 mod node_logs;
 mod own_log;
+mod parts;
 pub(crate) mod points;
 mod queued;
 mod reports;

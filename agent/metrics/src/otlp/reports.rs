@@ -29,8 +29,22 @@ pub(super) struct Report {
     signal: Signal,
     exports: Arc<Exports>,
     has_attempt: Cell<bool>,
-    is_refused: Cell<bool>,
+    failure: Cell<Failure>,
     rejected: Cell<u64>,
+}
+
+/// Why a request failed.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) enum Failure {
+    /// The connection broke, or the receiver is busy.
+    #[default]
+    Temporary,
+    /// The answer did not come in time.
+    TimedOut,
+    /// The receiver does not accept messages of this size.
+    TooLarge,
+    /// The request must not be repeated.
+    Refused,
 }
 
 impl Report {
@@ -41,7 +55,7 @@ impl Report {
             signal,
             exports,
             has_attempt: Cell::new(is_again),
-            is_refused: Cell::default(),
+            failure: Cell::default(),
             rejected: Cell::default(),
         }
     }
@@ -58,9 +72,9 @@ impl Report {
         REPORT.scope(self, export).await
     }
 
-    /// Returns whether the library does not repeat the request.
-    pub(super) fn is_refused(&self) -> bool {
-        self.is_refused.get()
+    /// Returns why the request failed.
+    pub(super) fn failure(&self) -> Failure {
+        self.failure.get()
     }
 
     /// Returns the number of items that the receiver rejected while it accepted the others.
@@ -71,8 +85,16 @@ impl Report {
 
 /// Runs an export whose outcome does not belong to the request in progress.
 pub(super) async fn unreported(export: impl Future<Output = OTelSdkResult>) -> OTelSdkResult {
+    unreported_failure(export).await.0
+}
+
+/// The same, and returns why it failed.
+pub(super) async fn unreported_failure(
+    export: impl Future<Output = OTelSdkResult>,
+) -> (OTelSdkResult, Failure) {
     let report = Report::new(Signal::Log, Arc::default(), false);
-    report.of(export).await.0
+    let (result, report) = report.of(export).await;
+    (result, report.failure())
 }
 
 /// Notes that a request is sent; called by the transport.
@@ -92,9 +114,9 @@ pub(super) fn rejected(items: i64) {
     let _ = REPORT.try_with(|report| report.rejected.set(u64::try_from(items).unwrap_or(0)));
 }
 
-/// Notes that the request in progress must not be repeated.
-pub(super) fn refused() {
-    let _ = REPORT.try_with(|report| report.is_refused.set(true));
+/// Notes why the request in progress failed.
+pub(super) fn failed(failure: Failure) {
+    let _ = REPORT.try_with(|report| report.failure.set(failure));
 }
 
 /// The subscriber of the export thread.
@@ -150,7 +172,7 @@ impl Subscriber for Reports {
         if metadata.name().ends_with(".PartialSuccess") {
             event.record(&mut PartialSuccess);
         } else if metadata.name() == "Export.Failed.NonRetryable" {
-            refused();
+            failed(Failure::Refused);
         }
     }
 

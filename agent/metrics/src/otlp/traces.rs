@@ -139,6 +139,14 @@ impl Persist for SpanExport {
             .send_encoded::<ExportTraceServiceRequest>(request)
             .await
     }
+
+    fn divided(request: &[u8], place: u64) -> Option<[Vec<u8>; 2]> {
+        EncodedSender::divided::<ExportTraceServiceRequest>(request, place)
+    }
+
+    fn padded(request: &[u8]) -> Vec<u8> {
+        EncodedSender::padded::<ExportTraceServiceRequest>(request)
+    }
 }
 
 /// Converts spans of the queue to the SDK's form.

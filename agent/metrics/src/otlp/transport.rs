@@ -22,6 +22,7 @@ use tonic::transport::{Channel, ClientTlsConfig, Endpoint};
 use super::encoded_sender::EncodedSender;
 use super::reports;
 use super::settings::{SettingsError, Target};
+use crate::connector::{connect_timeout, connector};
 
 /// Interval of HTTP/2 pings while a request is open. A connection that does not answer a ping is
 /// closed and opened again.
@@ -159,7 +160,7 @@ fn channel(target: &Target) -> Result<Channel, SettingsError> {
         endpoint
     };
     let endpoint = endpoint
-        .connect_timeout(target.timeout)
+        .connect_timeout(connect_timeout(target.timeout))
         .timeout(target.timeout)
         .http2_keep_alive_interval(PING_INTERVAL);
     Ok(endpoint.connect_lazy())
@@ -168,7 +169,7 @@ fn channel(target: &Target) -> Result<Channel, SettingsError> {
 fn http_client(target: &Target, sent: &SentHeaders) -> Result<Arc<dyn HttpClient>, SettingsError> {
     let (headers, sent) = (target.headers.clone(), Arc::clone(sent));
     if target.endpoint.scheme_str() != Some("https") {
-        let client = HyperClient::with_default_connector(target.timeout, None);
+        let client = HyperClient::new(connector(target.timeout), target.timeout, None);
         return Ok(Arc::new(Client {
             client,
             headers,
@@ -180,7 +181,7 @@ fn http_client(target: &Target, sent: &SentHeaders) -> Result<Arc<dyn HttpClient
         .map_err(SettingsError::Authorities)?
         .https_only()
         .enable_http1()
-        .build();
+        .wrap_connector(connector(target.timeout));
     let client = HyperClient::new(connector, target.timeout, None);
     Ok(Arc::new(Client {
         client,
@@ -211,5 +212,32 @@ impl<C: HttpClient> HttpClient for Client<C> {
 fn overwrite(headers: &mut HeaderMap, own: &HeaderMap) {
     for (name, value) in own {
         headers.insert(name.clone(), value.clone());
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tokio::time::error::Elapsed;
+
+    use super::*;
+    use crate::connector::tests::Unreachable;
+
+    #[tokio::test]
+    async fn a_receiver_out_of_reach_is_no_slow_one_over_http() {
+        let receiver = Unreachable::new();
+        let timeout = Duration::from_secs(1);
+        let is_slow = async |address| {
+            let client = HyperClient::new(connector(timeout), timeout, None);
+            let mut request = Request::new(Bytes::new());
+            *request.uri_mut() = format!("http://{address}/v1/logs").parse().unwrap();
+            client
+                .send_bytes(request)
+                .await
+                .unwrap_err()
+                .is::<Elapsed>()
+        };
+        assert!(!is_slow(receiver.address).await);
+        let silent = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+        assert!(is_slow(silent.local_addr().unwrap()).await);
     }
 }

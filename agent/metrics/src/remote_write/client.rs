@@ -21,6 +21,7 @@ use tokio_rustls::rustls::{ClientConfig, RootCertStore};
 
 use super::request::Version;
 use super::settings::{Settings, SettingsError};
+use crate::connector::connector;
 
 const VERSION_HEADER: HeaderName = HeaderName::from_static("x-prometheus-remote-write-version");
 /// Number of samples that a receiver of version 2.0 wrote.
@@ -49,7 +50,7 @@ pub(super) enum WriteResult {
     Accepted,
     /// The request may succeed later; at the earliest after this time.
     RetryLater(String, Option<Duration>),
-    /// No answer arrived in time. On a slow link, a smaller request may succeed.
+    /// No answer arrived in time over a connection. On a slow link, a smaller request may succeed.
     Late,
     /// The receiver refuses these samples. It wrote this number of them, if it knows.
     Refused(String, Option<u64>),
@@ -149,7 +150,8 @@ fn authorization(settings: &Settings) -> Result<Option<HeaderValue>, SettingsErr
 
 fn connections(settings: &Settings) -> Result<Connections, SettingsError> {
     let builder = HttpsConnectorBuilder::new().with_tls_config(tls(settings)?);
-    let connector = builder.https_or_http().enable_http1().build();
+    let builder = builder.https_or_http().enable_http1();
+    let connector = builder.wrap_connector(connector(settings.timeout));
     Ok(HttpClient::builder(TokioExecutor::new()).build(connector))
 }
 
@@ -254,6 +256,41 @@ fn in_words(error: &dyn std::error::Error) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::connector::tests::Unreachable;
+    use crate::otlp::Host;
+    use crate::remote_write::RemoteWriteSettings;
+
+    /// Returns a client of a receiver whose requests may take a second.
+    fn client(receiver: std::net::SocketAddr) -> Client {
+        let file = RemoteWriteSettings {
+            url: Some(format!("http://{receiver}/api/v1/write")),
+            timeout: Duration::from_secs(1),
+            ..RemoteWriteSettings::default()
+        };
+        let host = Host {
+            name: Some("robot-7".to_owned()),
+            id: None,
+        };
+        let settings = Settings::resolve(&file, |path, _| std::fs::read_to_string(path), &host);
+        Client::new(Arc::new(settings.unwrap().unwrap())).unwrap()
+    }
+
+    #[tokio::test]
+    async fn a_receiver_out_of_reach_is_no_slow_one() {
+        let receiver = Unreachable::new();
+        let result = client(receiver.address)
+            .send(Bytes::new(), Version::Two)
+            .await;
+        let WriteResult::RetryLater(reason, None) = result else {
+            panic!("{result:?}");
+        };
+        assert!(reason.contains("tcp connect error"), "{reason}");
+        // Its connections are accepted by the kernel, and nothing answers.
+        let silent = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+        let client = client(silent.local_addr().unwrap());
+        let result = client.send(Bytes::new(), Version::Two).await;
+        assert_eq!(result, WriteResult::Late);
+    }
 
     #[test]
     fn an_answer_decides_whether_samples_are_sent_again() {

@@ -137,7 +137,6 @@ impl Examiner {
         }
         lonely.examine(discovery, &mut findings);
         nodes::examine(discovery, &mut findings);
-        nodes::examine_machines(discovery, &mut findings);
         for (topic, writer) in services.hanging() {
             findings.add(Diagnosis::HangingCall { topic, writer });
         }

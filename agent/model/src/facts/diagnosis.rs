@@ -228,20 +228,14 @@ pub enum Diagnosis {
         /// Backends that the publisher shares with a subscription, sorted.
         backends: Vec<Box<str>>,
     },
-    /// Participants with different addresses announce one machine id: Fast DDS sends their messages
-    /// to shared memory only.
-    SharedMachineId {
-        /// Domain.
-        domain_id: DomainId,
-        /// The first participant of each set of addresses, sorted.
-        participants: Vec<Guid>,
-    },
     /// TCP retransmits many segments on the way to another host.
     LossyLink {
         /// The link.
         link: LinkKey,
         /// Retransmitted segments per 1000.
         retransmitted_permille: u64,
+        /// Bytes that wait to be sent; `None` if the kernel does not show them.
+        unsent: Option<u64>,
     },
     /// A node logs errors in a burst: at least ten in a minute, or a fatal one.
     LogErrors {
@@ -440,7 +434,7 @@ pub enum Change<'a> {
 
 impl Diagnosis {
     /// All kinds, as label values.
-    pub const KINDS: [&'static str; 29] = [
+    pub const KINDS: [&'static str; 28] = [
         "qos_incompatible",
         "type_conflict",
         "type_hash_conflict",
@@ -457,7 +451,6 @@ impl Diagnosis {
         "observation_suspended",
         "restamping_node",
         "buffers_by_cpu",
-        "shared_machine_id",
         "lossy_link",
         "log_errors",
         "diagnostic_error",
@@ -492,7 +485,6 @@ impl Diagnosis {
             Self::ObservationSuspended { .. } => "observation_suspended",
             Self::RestampingNode { .. } => "restamping_node",
             Self::BuffersByCpu { .. } => "buffers_by_cpu",
-            Self::SharedMachineId { .. } => "shared_machine_id",
             Self::LossyLink { .. } => "lossy_link",
             Self::LogErrors { .. } => "log_errors",
             Self::DiagnosticError { .. } => "diagnostic_error",
@@ -530,7 +522,6 @@ impl Diagnosis {
             | Self::LateCallback { topic, .. } => topic.as_ref(),
             Self::DuplicateNode { .. }
             | Self::NodeInSeveralDomains { .. }
-            | Self::SharedMachineId { .. }
             | Self::LossyLink { .. }
             | Self::LogErrors { .. }
             | Self::DiagnosticError { .. }
@@ -659,10 +650,6 @@ impl Diagnosis {
                 namespace,
                 ..
             } => (*domain_id, namespace, None, None),
-            Self::SharedMachineId {
-                domain_id,
-                participants,
-            } => (*domain_id, "", participants.first().copied(), None),
             Self::SlowCallback { .. }
             | Self::ExecutorWait { .. }
             | Self::LateCallback { .. }

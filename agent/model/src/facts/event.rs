@@ -397,7 +397,6 @@ pub fn bounded_finding(finding: &Diagnosis) -> Diagnosis {
         Diagnosis::TypeHashConflict { hashes, .. } => hashes.truncate(MAX_LIST),
         Diagnosis::DuplicateNode { participants, .. } => participants.truncate(MAX_LIST),
         Diagnosis::NodeInSeveralDomains { domains, .. } => domains.truncate(MAX_LIST),
-        Diagnosis::SharedMachineId { participants, .. } => participants.truncate(MAX_LIST),
         Diagnosis::LogErrors { text, .. } => *text = truncated(text).into(),
         Diagnosis::ClocksApart { peer, .. } => *peer = truncated(peer).into(),
         Diagnosis::QosIncompatible { .. }

@@ -10,6 +10,7 @@ use crate::facts::dispatch::MissedReason;
 use crate::facts::event::Events;
 use crate::facts::loss::{DeliveryLoss, Loss};
 use crate::facts::model_time::ModelTime;
+use crate::facts::repairs::RepairLog;
 use crate::facts::tables::{DiscoveryEvents, LatestDeliveryLosses, LatestLosses, MissingSamples};
 
 /// Number of the latest entries that a new loss may extend.
@@ -54,6 +55,8 @@ pub struct Journal {
     missing: Bounded<MissingSamples, Vec<Missing>>,
     /// Events that wait to be taken.
     pub events: Events,
+    /// Retransmissions that arrived.
+    pub repairs: RepairLog,
 }
 
 impl Journal {

@@ -21,6 +21,7 @@ pub mod names;
 pub mod naming;
 pub mod observation;
 pub mod rate;
+pub mod repairs;
 pub mod robot;
 pub mod route;
 pub mod selection;

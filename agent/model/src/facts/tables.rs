@@ -15,6 +15,8 @@ crate::tables! {
     }
     /// Losses at a socket of an unknown participant that are reported later, per socket
     WithheldLosses { name: "delivery.withheld", entries: 64, rule: Oldest, effect: "the oldest is only counted" }
+    /// Latest retransmissions that reached receivers on this host
+    Retransmissions { name: "retransmissions", entries: 4096, rule: Oldest }
     /// Drops at a full socket buffer that wait for the datagram's arrival record, per receiver
     UndeliveredParts { name: "undelivered.waiting", entries: 4096, rule: Oldest, reported: "table `samples`" }
     /// Departures of one writer's latest samples
@@ -120,6 +122,8 @@ crate::tables! {
     }
     /// Pairs of addresses with such connections
     TcpLinks { name: "links", entries: 256, effect: "further ones do not count" }
+    /// Connections that began with a handshake of TLS in the last minute
+    ClientHellos { name: "client_hellos", entries: 1024, effect: "further ones do not count" }
     /// Writers and readers with a verdict for the kernel, and removed ones that the kernel still has
     InterestEntries {
         name: "interest.entries", entries: CONFIGURED, effect: "treated as unclassified, within that budget",

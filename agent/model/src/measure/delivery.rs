@@ -14,7 +14,7 @@ mod withheld;
 use std::collections::{BTreeSet, VecDeque};
 use std::time::Duration;
 
-use ros2probe_wire::{Guid, GuidPrefix, SequenceNumber};
+use ros2probe_wire::{Guid, GuidPrefix, RtpsTime, SequenceNumber};
 
 use crate::facts::bounded::Bounded;
 use crate::facts::journal::Journal;
@@ -534,7 +534,12 @@ impl Delivery {
             return;
         }
         let mut waited = 0.0;
-        if recovered && self.direction() == Direction::Received {
+        let is_received = self.direction() == Direction::Received;
+        // The last fragments of a sample may be lost without a gap.
+        if is_received && !is_history && (recovered || !whole.newest) {
+            self.note_repair(whole.source, context);
+        }
+        if recovered && is_received {
             let noticed = known_loss.map(|known_loss| known_loss.at).or(missed);
             let waited_for = noticed.map_or(whole.repaired_after, |noticed| {
                 context.now.nanoseconds_since(noticed)
@@ -560,6 +565,16 @@ impl Delivery {
         }
     }
 
+    /// Notes a retransmission of a message with this source timestamp.
+    fn note_repair(&self, source: RtpsTime, context: &mut DeliveryContext<'_>) {
+        if let Receiver::Participant(receiver) = self.receiver
+            && self.is_reliable(context)
+        {
+            let pair = (context.writer, receiver);
+            context.journal.repairs.push(pair, source, context.now);
+        }
+    }
+
     /// Handles a sample that arrives after it was settled as lost. A whole sample whose loss cause
     /// is still pending counts as recovered. Any other sample counts as a duplicate.
     fn late(
@@ -577,6 +592,7 @@ impl Delivery {
                 tally.recovered += 1;
             });
             self.reception.sequence_mut().know(number);
+            self.note_repair(sample.source_timestamp, context);
             return (false, None);
         }
         if is_whole {

@@ -1,5 +1,5 @@
-//! TCP connections to other hosts that carry RTPS or Zenoh: round trip times and retransmissions,
-//! as the kernel of the sender counts them. The connections between two addresses are one link.
+//! TCP connections to other hosts that carry RTPS or Zenoh: round trip times, retransmissions and
+//! send queues, as the kernel of the sender counts them. The connections between two addresses are one link.
 
 use std::collections::{BTreeMap, HashMap};
 use std::time::Duration;
@@ -58,6 +58,9 @@ pub struct LinkFacts {
     pub round_trip: Option<Duration>,
     /// Bytes of the current connections that were sent and are not acknowledged.
     pub unacknowledged: u64,
+    /// Bytes that the applications wrote to the current connections and the kernel has not sent
+    /// yet; `None` if no connection reports them.
+    pub unsent: Option<u64>,
 }
 
 /// All links.
@@ -197,7 +200,16 @@ impl Links {
         lossy.map(|(key, link)| Diagnosis::LossyLink {
             link: *key,
             retransmitted_permille: link.permille(),
+            unsent: self.unsent(key),
         })
+    }
+
+    /// Returns the bytes that wait to be sent on a link; `None` if no connection reports them.
+    fn unsent(&self, key: &LinkKey) -> Option<u64> {
+        let own = self.connections.values().filter(|each| each.key == *key);
+        let reported = own.filter(|each| each.state.unsent_known != 0);
+        let waiting = reported.map(|each| u64::from(each.state.unsent));
+        waiting.reduce(|sum, each| sum + each)
     }
 
     /// Returns the figures of all links.
@@ -212,6 +224,7 @@ impl Links {
                 retransmitted: link.retransmitted,
                 round_trip: None,
                 unacknowledged: 0,
+                unsent: None,
             };
             facts.insert(*key, known);
         }
@@ -221,6 +234,10 @@ impl Links {
                 link.connections += 1;
                 link.round_trip = link.round_trip.max(Some(time));
                 link.unacknowledged += u64::from(connection.state.unacknowledged);
+                if connection.state.unsent_known != 0 {
+                    let others = link.unsent.unwrap_or(0);
+                    link.unsent = Some(others + u64::from(connection.state.unsent));
+                }
             }
         }
         facts.into_values().collect()
@@ -251,6 +268,8 @@ mod tests {
                 retransmitted,
                 sent,
                 unacknowledged: 100,
+                unsent: 1000,
+                unsent_known: u32::from(peer != 9),
             },
         }
     }
@@ -274,7 +293,7 @@ mod tests {
             (2, 130, 3)
         );
         assert_eq!(facts.round_trip, Some(Duration::from_micros(2002)));
-        assert_eq!(facts.unacknowledged, 200);
+        assert_eq!((facts.unacknowledged, facts.unsent), (200, Some(2000)));
         // The kernel's counters have 32 bits.
         links.report(&report(3, 3, u32::MAX, u32::MAX), at(1));
         links.report(&report(3, 3, 9, 0), at(2));
@@ -282,6 +301,20 @@ mod tests {
             (links.facts()[1].sent, links.facts()[1].retransmitted),
             (10, 1)
         );
+    }
+
+    #[test]
+    fn bytes_that_wait_to_be_sent_are_unknown_without_a_report_of_them() {
+        let mut links = Links::default();
+        links.report(&report(1, 9, 10, 0), at(0));
+        assert_eq!(links.facts()[0].unsent, None);
+        // One connection of the link reports them.
+        let mut other = report(2, 9, 10, 0);
+        other.state.unsent_known = 1;
+        links.report(&other, at(0));
+        assert_eq!(links.facts()[0].unsent, Some(1000));
+        links.forget(2);
+        assert_eq!(links.facts()[0].unsent, None);
     }
 
     #[test]

@@ -21,6 +21,7 @@ pub mod sampled;
 pub mod samples;
 pub mod sequence;
 pub mod subscribers;
+pub mod tls;
 pub mod topic;
 pub mod undelivered;
 pub mod writer;

@@ -25,6 +25,7 @@ use crate::facts::shared_memory::MemoryUse;
 use crate::facts::watch::Watchlist;
 use crate::graph::discovery::Memory;
 use crate::graph::sockets::SocketFacts;
+use crate::graph::zenoh::Flow;
 use crate::graph::zenoh::StreamReport;
 use crate::measure::links::LinkReport;
 
@@ -97,6 +98,8 @@ pub enum Input<'a> {
     ProbesDetached,
     /// The sender's state of a TCP connection to another host.
     Link(&'a LinkReport),
+    /// A client begins a handshake of TLS in this direction.
+    ClientHello(Flow),
     /// A report about one direction of a Zenoh connection.
     Zenoh(&'a StreamReport<'a>),
     /// A submessage that a source saw, with model time from [`Observer::wall_clock`].

@@ -65,6 +65,7 @@ use crate::measure::links::Links;
 use crate::measure::payloads::Payloads;
 use crate::measure::profiler::{ObservationOutcome, Profiler};
 use crate::measure::receivers::{Graph, Receivers};
+use crate::measure::tls::TlsConnections;
 use crate::measure::topic::{Accelerated, TopicId, Topics, Watched};
 use crate::observe::input::{Captured, Input, NewLog, Output};
 use crate::observe::interest::Interest;
@@ -134,6 +135,7 @@ pub(crate) struct Measure {
     pub(crate) payloads: Payloads,
     pub(crate) latched: Latched,
     pub(crate) links: Links,
+    pub(crate) tls: TlsConnections,
 }
 
 /// State derived from graph and samples.
@@ -201,6 +203,7 @@ impl Observer {
                 payloads: Payloads::new(settings.payload_bytes, settings.payload_delay),
                 latched: Latched::default(),
                 links: Links::default(),
+                tls: TlsConnections::default(),
             },
             derive: Derive {
                 services: Services::default(),
@@ -270,6 +273,7 @@ impl Observer {
                 let now = self.clock;
                 self.measure.links.report(report, now);
             }
+            Input::ClientHello(flow) => self.measure.tls.hello(flow, self.clock),
             Input::Zenoh(report) => self.zenoh_report(report),
             Input::Observation(observation) => self.observe(observation),
             Input::ParticipantAlive(prefix, at) => {

@@ -85,6 +85,8 @@ pub struct Snapshot {
     pub chains: ChainsFacts,
     /// TCP connections to other hosts, by pair of addresses.
     pub links: Vec<LinkFacts>,
+    /// TCP connections of RTPS that begin with a handshake of TLS, since the start.
+    pub tls_connections: u64,
     /// Logs of nodes.
     pub logs: LogFacts,
     /// Diagnostics.

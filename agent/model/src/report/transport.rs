@@ -148,6 +148,9 @@ pub(crate) fn transport(discovery: &Discovery, writer: Guid, reader: Guid) -> Op
     } else if !(shared_memory(writer, of_writer) && shared_memory(reader, of_reader)) {
         return Some(network());
     } else if vendor == VendorId::EPROSIMA {
+        if is_another_generation(discovery, writer.prefix, reader.prefix) {
+            return Some(network());
+        }
         Transport::SharedMemory
     } else {
         Transport::Iceoryx
@@ -175,10 +178,24 @@ fn is_one_process(discovery: &Discovery, one: GuidPrefix, other: GuidPrefix) -> 
             && one.0.first_chunk::<8>() == other.0.first_chunk::<8>()
 }
 
-/// Returns whether both participants consider each other to be on one host. Fast DDS 3.2 and later
-/// compares the ids of the machines, earlier ones the first four bytes of the prefixes, which hold
-/// vendor and host. Others announce no host, so participants without a common address are on two,
-/// unless both send from this host. Only participants that announce shared memory are compared.
+/// Returns whether the shared memory of both participants of Fast DDS has different formats: the
+/// kind of its locator contains the major version, so that 2 and 3 use the network. Versions before
+/// 3.0 are not announced.
+fn is_another_generation(discovery: &Discovery, one: GuidPrefix, other: GuidPrefix) -> bool {
+    let participants = discovery.participants();
+    let generation = |prefix| {
+        let version = &participants.get(&prefix)?.proxy.product_version;
+        version.as_deref().unwrap_or("2").split('.').next()
+    };
+    let known = generation(one).zip(generation(other));
+    known.is_some_and(|(one, other)| one != other)
+}
+
+/// Returns whether both participants consider each other to be on one host. Fast DDS compares the
+/// host's part of its locators of shared memory, which is that of the prefixes, too: the first four
+/// bytes hold vendor and host. It announces an id of the machine since 3.2, and does not compare it
+/// for this. Others announce no host, so participants without a common address are on two, unless
+/// both send from this host. Only participants that announce shared memory are compared.
 fn is_one_host(
     discovery: &Discovery,
     vendor: VendorId,
@@ -192,11 +209,7 @@ fn is_one_host(
             one.local && other.local || !one.addresses.are_apart(&other.addresses)
         });
     }
-    let machine = |prefix| participants.get(&prefix)?.proxy.machine_id.as_ref();
-    match (machine(one), machine(other)) {
-        (Some(one), Some(other)) => one == other,
-        _ => one.0.first_chunk::<4>() == other.0.first_chunk::<4>(),
-    }
+    one.0.first_chunk::<4>() == other.0.first_chunk::<4>()
 }
 
 #[cfg(test)]

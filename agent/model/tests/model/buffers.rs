@@ -2,7 +2,6 @@
 //! `rmw_publish.cpp`): a second writer and reader carry the messages, and nodes announce only the
 //! first ones.
 
-use ros2probe_model::facts::diagnosis::Diagnosis;
 use ros2probe_model::report::snapshot::{EndpointFacts, TopicFacts};
 use ros2probe_testing::model::forge::{self, AnnouncedNode, Message, SEDP_READERS, SEDP_WRITERS};
 use ros2probe_testing::model::host::{ALICE, BOB, CapturePoint, Host, READER, WRITER};
@@ -188,20 +187,28 @@ fn references_count_only_while_no_subscription_gets_messages() {
     assert_eq!(topic.measurement.as_ref().unwrap().loss.lost, 0);
 }
 
+/// Real nodes of Fast DDS 3.2.2 and 2.14 behave so: the host in a GUID decides, and not the id of
+/// the machine, and shared memory of 2 and 3 has different formats.
 #[test]
-fn participants_with_one_machine_id_are_on_one_host_despite_different_guids() {
-    let machine = |host: &mut Host, prefix: GuidPrefix, number, id: &str| {
-        let list = forge::participant_on(prefix, id, [10, 0, 0, 1]);
-        host.announce(Message::from_fast(prefix).data(forge::SPDP, number, &list));
+fn participants_of_one_host_and_generation_share_memory_whatever_their_machine_ids() {
+    let machine = |host: &mut Host, prefix: GuidPrefix, id: &str, version| {
+        let list = forge::participant_of_version(prefix, id, [10, 0, 0, 1], version);
+        host.announce(Message::from_fast(prefix).data(forge::SPDP, 1, &list));
     };
-    for (of_bob, passage) in [("a", "shared_memory"), ("b", "network")] {
+    let (new, old) = (Some([3, 2, 2, 0]), None);
+    for (of_bob, host_of_bob, version, passage) in [
+        ("a", 1, new, "shared_memory"),
+        ("b", 1, new, "shared_memory"),
+        ("a", 2, new, "network"),
+        ("a", 1, old, "network"),
+    ] {
         let mut host = Host::new();
         let (alice, bob) = (
             GuidPrefix([1, 15, 1, 1, 1, 0, 1, 0, 0, 0, 0, 0]),
-            GuidPrefix([1, 15, 2, 2, 2, 0, 2, 0, 0, 0, 0, 0]),
+            GuidPrefix([1, 15, host_of_bob, 1, 2, 0, 2, 0, 0, 0, 0, 0]),
         );
-        machine(&mut host, alice, 1, "a");
-        machine(&mut host, bob, 1, of_bob);
+        machine(&mut host, alice, "a", new);
+        machine(&mut host, bob, of_bob, version);
         announce(&mut host, 2, Guid::new(alice, WRITER), "", CPU);
         announce(&mut host, 2, Guid::new(bob, READER), "", CPU);
         let topic = image(&host);
@@ -252,37 +259,32 @@ fn references_count_whichever_subscription_gets_them_and_once() {
     assert_eq!(topic.measurement.as_ref().unwrap().loss.lost, 0);
 }
 
-/// Announces a participant with this machine id, host in its GUID, and address.
-fn on_machine(host: &mut Host, number: u8, in_guid: u8, id: &str, address: [u8; 4]) {
-    let prefix = GuidPrefix([1, 15, in_guid, 0, number, 0, 1, 0, 0, 0, 0, 0]);
-    let list = forge::participant_on(prefix, id, address);
-    host.announce(Message::from_fast(prefix).data(forge::SPDP, 1, &list));
-}
-
 #[test]
-fn cloned_machines_are_a_finding_and_participants_of_one_host_are_not() {
-    let apart = |participants: &[(u8, &str, [u8; 4])]| {
-        let mut host = Host::new();
-        for (number, (in_guid, id, address)) in participants.iter().enumerate() {
-            on_machine(&mut host, number as u8, *in_guid, id, *address);
-        }
-        host.wait(1000);
-        let list = host.snapshot().diagnoses.list.clone();
-        let found = list.iter().find_map(|finding| match finding {
-            Diagnosis::SharedMachineId { participants, .. } => Some(participants.len()),
-            _ => None,
-        });
-        found.unwrap_or(0)
-    };
-    let (one, two, three) = ([10, 0, 0, 1], [10, 0, 0, 2], [10, 0, 0, 3]);
-    assert_eq!(apart(&[(1, "a", one), (2, "a", two), (3, "a", three)]), 3);
-    // Other ids, one address, or one host in the GUIDs.
-    assert_eq!(apart(&[(1, "a", one), (2, "b", two)]), 0);
-    assert_eq!(apart(&[(1, "a", one), (2, "a", one)]), 0);
-    assert_eq!(apart(&[(1, "a", one), (1, "a", two)]), 0);
-    // The second participant connects the others.
-    assert_eq!(
-        apart(&[(1, "a", one), (2, "a", one), (2, "a", two), (3, "a", two)]),
-        0
-    );
+fn references_of_publishers_beyond_the_cap_do_not_count() {
+    const CAP: usize = 64;
+    let (mut host, bob) = robot(CUDA);
+    let suffix = format!("/_buf/{}", digits(reader(BOB, 0x21)));
+    let of_references = |number| Guid::new(ALICE, EntityId([0, 1, number, 0x03]));
+    // One publisher exists already.
+    let others = 100..100 + CAP as u8 + 5;
+    for number in others.clone() {
+        announce(&mut host, number.into(), writer(number), "", CUDA);
+        let with_publisher = format!("{CUDA}PGID:{}", digits(writer(number)));
+        let sender = of_references(number);
+        announce(
+            &mut host,
+            100 + u64::from(number),
+            sender,
+            &suffix,
+            &with_publisher,
+        );
+    }
+    publish(&mut host, bob, writer(0x33), 1..=2);
+    for number in others {
+        publish(&mut host, bob, of_references(number), 1..=2);
+    }
+    let topic = image(&host);
+    assert_eq!(topic.publishers.len(), CAP + 6);
+    let counted = topic.publishers.iter().filter(|each| messages(each) > 0);
+    assert_eq!(counted.count(), CAP);
 }

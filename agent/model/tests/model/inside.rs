@@ -4,6 +4,7 @@
 mod findings;
 mod late;
 mod queues;
+mod repairs;
 mod slow;
 mod sources;
 mod sums;

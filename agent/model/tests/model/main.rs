@@ -40,6 +40,7 @@ mod room;
 mod services;
 mod stamps;
 mod start_orders;
+mod tls;
 mod transforms;
 mod transports;
 mod type_objects;

@@ -1,5 +1,7 @@
 //! What the robot itself says: its transforms.
 
+use std::time::Duration;
+
 use ros2probe_model::derive::robot::Parts;
 use ros2probe_model::facts::diagnosis::Diagnosis;
 use ros2probe_model::facts::event::EventKind;
@@ -111,6 +113,12 @@ impl Robot {
     }
 }
 
+/// Returns the longest of the latest intervals of `base_link`, in milliseconds.
+fn interval(robot: &Robot) -> Option<u128> {
+    let interval = robot.edge("base_link").longest_interval;
+    interval.map(|interval| interval.as_millis())
+}
+
 fn names<const N: usize>(names: [&str; N]) -> Vec<String> {
     names.map(str::to_owned).to_vec()
 }
@@ -129,7 +137,17 @@ fn an_edge_has_its_last_transform_its_rate_and_its_broadcaster() {
     assert_eq!(edge.stamp, (13, 0));
     assert_eq!(edge.broadcasters[0].node.as_deref(), Some("/ekf"));
     assert!((edge.rate.unwrap() - 10.0).abs() < 0.2, "{edge:?}");
+    assert_eq!(edge.longest_interval, Some(Duration::from_millis(100)));
     assert_eq!(robot.faults(), []);
+    // A gap counts less with each transform after it.
+    robot.wait(800);
+    robot.broadcast(FIRST, "odom", "base_link", 7.0);
+    assert_eq!(interval(&robot), Some(800));
+    robot.wait(100);
+    robot.broadcast(FIRST, "odom", "base_link", 7.0);
+    assert_eq!(interval(&robot), Some(700));
+    robot.broadcast_for(FIRST, 3);
+    assert_eq!(interval(&robot), Some(100));
 }
 
 #[test]
@@ -150,6 +168,7 @@ fn static_and_moving_transforms_of_each_namespace_are_separate() {
     assert!(robot1.edges[0].is_static && !root.edges[0].is_static);
     assert_eq!(robot1.unread_static, 0);
     assert_eq!(robot1.edges[0].rate, None);
+    assert_eq!(robot1.edges[0].longest_interval, None);
 }
 
 #[test]

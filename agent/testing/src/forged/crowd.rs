@@ -7,9 +7,10 @@
 mod member;
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use anyhow::Result;
+use anyhow::{Result, anyhow};
 
 use super::storm::Dice;
 use super::{Carrier, PARTICIPANT, SPDP_WRITER};
@@ -122,6 +123,26 @@ impl<C: Carrier> Crowd<C> {
             self.tick(false)?;
         }
         Ok(())
+    }
+
+    /// Renews leases on another thread while `work` runs.
+    pub fn idle_during<T>(&mut self, work: impl FnOnce() -> Result<T>) -> Result<T>
+    where
+        C: Send,
+    {
+        let is_done = AtomicBool::new(false);
+        std::thread::scope(|scope| {
+            let idling = scope.spawn(|| -> Result<()> {
+                while !is_done.load(Ordering::Relaxed) {
+                    self.idle(Duration::from_millis(10))?;
+                }
+                Ok(())
+            });
+            let result = work();
+            is_done.store(true, Ordering::Relaxed);
+            idling.join().map_err(|_| anyhow!("the crowd died"))??;
+            result
+        })
     }
 
     /// Returns whether a lease ends so soon that an observer may or may not have noticed its end.

@@ -6,7 +6,8 @@ pub mod frames;
 pub mod storm;
 
 use std::net::{SocketAddr, UdpSocket};
-use std::time::Duration;
+use std::sync::mpsc::{self, RecvTimeoutError};
+use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result};
 use ros2probe_capture::netns;
@@ -194,6 +195,27 @@ impl Carrier for Sender {
     }
 }
 
+/// Interval of repeated announcements, as of real participants.
+const REPEAT: Duration = Duration::from_secs(3);
+
+/// Repeats an announcement until it is dropped, so that no lease ends while a test waits.
+pub struct Renewal {
+    /// Ends the announcements when it is dropped.
+    _stop: mpsc::Sender<()>,
+}
+
+impl Renewal {
+    pub fn start(mut carrier: impl Carrier + Send + 'static, announcement: Vec<u8>) -> Renewal {
+        let (stop, stopped) = mpsc::channel();
+        std::thread::spawn(move || {
+            while stopped.recv_timeout(REPEAT) == Err(RecvTimeoutError::Timeout) {
+                let _ = carrier.send(&announcement);
+            }
+        });
+        Renewal { _stop: stop }
+    }
+}
+
 /// Sends all announcements of the talker.
 pub fn introduce(talker: &Talker, carrier: &mut impl Carrier) -> Result<()> {
     for message in talker.introduction("talker") {
@@ -209,11 +231,39 @@ pub fn send_sizes(
     carrier: &mut impl Carrier,
     sizes: impl IntoIterator<Item = usize>,
 ) -> Result<()> {
+    let mut pace = Pace::new(Duration::from_millis(2));
     for size in sizes {
         carrier.send(&talker.sample(size))?;
-        std::thread::sleep(Duration::from_millis(2));
+        pace.wait();
     }
     Ok(())
+}
+
+/// Maximum delay that a sender makes up for, so that a long one causes no burst.
+const MAX_CATCH_UP: Duration = Duration::from_millis(20);
+
+/// Paces messages by the elapsed time, because a thread of a busy machine wakes late.
+pub struct Pace {
+    interval: Duration,
+    due: Instant,
+}
+
+impl Pace {
+    /// Starts with a message that is sent now.
+    pub fn new(interval: Duration) -> Pace {
+        Pace {
+            interval,
+            due: Instant::now() + interval,
+        }
+    }
+
+    /// Waits until the next message is due.
+    pub fn wait(&mut self) {
+        let now = Instant::now();
+        std::thread::sleep(self.due.saturating_duration_since(now));
+        let earliest = now.checked_sub(MAX_CATCH_UP).unwrap_or(now);
+        self.due = self.due.max(earliest) + self.interval;
+    }
 }
 
 /// Returns the frame in which Fast DDS sends a message of user data by TCP, without a checksum.

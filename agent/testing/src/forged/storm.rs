@@ -150,6 +150,11 @@ impl Storm {
         Storm { stop, sent, thread }
     }
 
+    /// Returns the number of datagrams sent so far.
+    pub fn sent(&self) -> u64 {
+        self.sent.load(Ordering::Relaxed)
+    }
+
     /// Stops sending. Returns the number of datagrams sent.
     pub fn end(self) -> Result<u64> {
         self.stop.store(true, Ordering::Relaxed);

@@ -24,19 +24,19 @@ pub const METRICS: &str = "http://127.0.0.1:17400";
 pub const ON_THE_WIRE: &str = "capture: {source: wire}\n";
 
 /// Maximum wait until the metrics show the sent messages, on a busy machine.
-const PATIENCE: Duration = Duration::from_secs(30);
+const PATIENCE: Duration = Duration::from_secs(90);
 /// Maximum wait for the kernel to verify the BPF programs on a busy machine.
-const START: Duration = Duration::from_secs(60);
+const START: Duration = Duration::from_secs(90);
 /// Maximum wait for further bytes of a response.
-const ANSWER: Duration = Duration::from_secs(20);
-/// Time without a change of the counters: longer than the second after which a gap of a best-effort
-/// stream is settled.
-const QUIET_TIME: Duration = Duration::from_millis(1800);
+const ANSWER: Duration = Duration::from_secs(60);
+/// Time between two snapshots with the same counters: longer than the second after which a gap of a
+/// best-effort stream is settled.
+const QUIET_TIME: Duration = Duration::from_millis(1500);
 /// The same time if the agent reports lost records or frames, so that some messages may never be
 /// counted.
 const STILL_WITHOUT_SOME: Duration = Duration::from_secs(6);
-/// Maximum age, in seconds, of the snapshot of an agent that received CPU time.
-const FRESH: f64 = 0.4;
+/// The same time after which missing messages are no longer expected.
+const STILL_INCOMPLETE: Duration = Duration::from_secs(30);
 
 /// `rp run` on a host.
 pub struct Agent<'a> {
@@ -127,23 +127,30 @@ impl<'a> Agent<'a> {
         }
     }
 
-    /// Scrapes until the agent has counted this many messages of a topic, or a timeout expires, and
-    /// its counters of that topic no longer change.
+    /// Scrapes until two snapshots that lie apart have the same counters of a topic. By then, the
+    /// agent has counted this many messages, or no further one for a long time.
     pub fn settled_scrape(&self, topic: &str, messages: u64) -> Result<Scrape> {
         let label = [("topic", topic)];
         let deadline = Instant::now() + PATIENCE;
         let (mut before, mut since) = (Vec::new(), Instant::now());
         loop {
+            let asked = Instant::now();
             let page = self.scrape()?;
+            let answered = Instant::now();
+            let age = page.sum("ros2probe_snapshot_age_seconds", &[]);
+            let age = Duration::try_from_secs_f64(age)?;
+            let taken = |at: Instant| at.checked_sub(age).unwrap_or(at);
             let now = page.counters(topic);
-            let is_fresh = page.sum("ros2probe_snapshot_age_seconds", &[]) < FRESH;
-            if now != before || !is_fresh {
-                (before, since) = (now, Instant::now());
+            if now != before {
+                (before, since) = (now, taken(answered));
             }
+            // The snapshot is at most as old as its age at the time of the request.
+            let still = taken(asked).saturating_duration_since(since);
             let all = page.sum("ros2_topic_messages_total", &label) >= messages as f64;
             let in_time = Instant::now() < deadline;
-            let is_lossy = dropped(&page) > 0.0 && since.elapsed() >= STILL_WITHOUT_SOME;
-            if since.elapsed() >= QUIET_TIME && (all || is_lossy || !in_time) {
+            let is_lossy = dropped(&page) > 0.0 && still >= STILL_WITHOUT_SOME;
+            let is_over = is_lossy || still >= STILL_INCOMPLETE || !in_time;
+            if still >= QUIET_TIME && (all || is_over) {
                 return Ok(page);
             }
             if Instant::now() > deadline + QUIET_TIME {

@@ -9,6 +9,10 @@ use std::path::Path;
 
 use anyhow::{Context as _, Result, bail};
 use aya::maps::{HashMap, Map, MapData, MapInfo};
+use ros2probe_wire::Guid;
+use ros2probe_wire::record::{Verdict, guid_words};
+
+use super::wait_until;
 
 const PROG_LOAD: libc::c_int = 5;
 const PROG_ATTACH: libc::c_int = 8;
@@ -134,6 +138,14 @@ pub fn interest_of(process: u32) -> Result<BTreeMap<[u32; 4], u32>> {
         }
     }
     bail!("the process {process} has no such map")
+}
+
+/// Waits until the kernel passes records of an endpoint to this process.
+pub fn wait_metered(process: u32, endpoint: Guid) -> Result<()> {
+    wait_until("the kernel meters the endpoint", || {
+        let verdict = interest_of(process)?.get(&guid_words(endpoint)).copied();
+        Ok(verdict.is_some_and(|verdict| verdict != Verdict::Ignore as u32))
+    })
 }
 
 /// Returns how often the kernel skipped a program of this process because it was already running on

@@ -41,7 +41,7 @@ impl Capture {
             path: path.to_owned(),
             stderr,
         };
-        let deadline = Instant::now() + Duration::from_secs(30);
+        let deadline = Instant::now() + Duration::from_secs(60);
         while !capture.stderr()?.contains("listening on") {
             if Instant::now() > deadline {
                 bail!("tcpdump does not begin: {}", capture.stderr()?);
@@ -57,7 +57,7 @@ impl Capture {
         self.process.signal("INT")?;
         let status = self
             .process
-            .wait(Duration::from_secs(30))
+            .wait(Duration::from_secs(60))
             .context("tcpdump")?;
         let stderr = self.stderr()?;
         if !status.success() {

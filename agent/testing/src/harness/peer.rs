@@ -4,14 +4,16 @@
 use std::net::SocketAddrV4;
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, bail};
+use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 use tempfile::TempDir;
 
 use super::event_log::EventLog;
 use super::network::Namespace;
 use super::process::Process;
+use super::wait_until;
 
 /// Maximum time of discovery on a busy machine.
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -116,7 +118,9 @@ impl Stack {
 }
 
 impl Stream {
-    /// Returns a stream of small samples, as from an IMU: 320 B at 200 Hz, best effort.
+    /// Returns a stream of small samples, as from an IMU: 320 B at 200 Hz, best effort. The history
+    /// holds five seconds of samples: RustDDS drops samples that it overwrites before a busy CPU
+    /// has sent them.
     pub fn small(count: u64) -> Stream {
         Stream {
             topic: "/imu".to_owned(),
@@ -125,7 +129,7 @@ impl Stream {
             count,
             reliable: false,
             transient_local: false,
-            depth: 100,
+            depth: 1000,
             domain: 0,
             logged: true,
             linger: 1.0,
@@ -304,6 +308,40 @@ impl Peer {
         self.process.wait_for("done", limit)
     }
 
+    /// Waits until a subscriber has logged this many samples.
+    pub fn wait_received(&self, count: u64) -> Result<()> {
+        wait_until("the subscriber has all samples", || {
+            Ok(self.log()?.sequences("sub").len() as u64 >= count)
+        })
+    }
+
+    /// Waits as [`Peer::wait_received`] does, but ends as well if the subscriber has logged no
+    /// further sample for three seconds.
+    pub fn wait_settled(&self, count: u64) -> Result<()> {
+        const QUIET: Duration = Duration::from_secs(3);
+        let (mut before, mut since) = (None, Instant::now());
+        wait_until("the subscriber has all samples that arrive", || {
+            let received = self.log()?.sequences("sub").len() as u64;
+            if before.replace(received) != Some(received) {
+                since = Instant::now();
+            }
+            Ok(received >= count || since.elapsed() >= QUIET)
+        })
+    }
+
+    /// Returns the GUID of the peer's endpoint, from its log.
+    pub fn guid(&self) -> Result<Guid> {
+        let log = self.log()?;
+        let digits = log.endpoints().find_map(|endpoint| endpoint.guid.clone());
+        let digits = digits.context("no GUID in the log")?;
+        let bytes = u128::from_str_radix(&digits, 16)?.to_be_bytes();
+        let (prefix, entity) = bytes.split_at(12);
+        Ok(Guid::new(
+            GuidPrefix(prefix.try_into()?),
+            EntityId(entity.try_into()?),
+        ))
+    }
+
     pub fn log_path(&self) -> PathBuf {
         self.directory.path().join("log")
     }
@@ -322,7 +360,7 @@ pub fn robot() -> Result<PathBuf> {
 /// its endpoints.
 pub fn start_robot(host: &Namespace, role: &str) -> Result<Process> {
     let mut robot = Process::start(&host.inside(), robot()?, ["--role", role])?;
-    robot.wait_for("ready", Duration::from_secs(20))?;
+    robot.wait_for("ready", PATIENCE)?;
     Ok(robot)
 }
 

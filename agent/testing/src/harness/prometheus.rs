@@ -14,7 +14,7 @@ use super::process::Process;
 pub const INSTALL: &str = "run `make prerequisites` or `apt-get install prometheus`";
 const SERVER: &str = "127.0.0.1:9090";
 /// Maximum wait for the result of a query.
-const PATIENCE: Duration = Duration::from_secs(40);
+const PATIENCE: Duration = Duration::from_secs(90);
 
 pub struct Prometheus<'a> {
     host: &'a Namespace,

@@ -32,7 +32,7 @@ impl Relay {
             number.as_ref(),
         ];
         let mut remote = Process::start(&host.on_network(), program, words)?;
-        remote.wait_for("ready", Duration::from_secs(5))?;
+        remote.wait_for("ready", Duration::from_secs(60))?;
         let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, port))
             .or_else(|_| TcpListener::bind((Ipv4Addr::LOCALHOST, 0)))
             .context("cannot listen on 127.0.0.1")?;

@@ -19,7 +19,7 @@ impl SharedMemory {
         let script = format!("{mount} && echo ready && exec cat");
         let arguments = ["--mount", "sh", "-c", &script];
         let mut keeper = Process::start(&host.on_network(), "unshare", arguments)?;
-        keeper.wait_for("ready", Duration::from_secs(10))?;
+        keeper.wait_for("ready", Duration::from_secs(60))?;
         Ok(SharedMemory { keeper })
     }
 

@@ -1,6 +1,6 @@
 //! Builds RTPS messages as real participants send them, and invalid ones.
 
-use std::net::SocketAddrV4;
+use std::net::{Ipv4Addr, SocketAddrV4};
 
 use ros2probe_wire::walk::Envelope;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix};
@@ -161,21 +161,47 @@ pub fn participant_at(
         list.push((0x0f, domain_id.to_le_bytes().to_vec()));
     }
     for address in unicast {
-        let mut locator = [
-            &1u32.to_le_bytes()[..],
-            &u32::from(address.port()).to_le_bytes(),
-        ]
-        .concat();
-        locator.extend_from_slice(&[0; 12]);
-        locator.extend_from_slice(&address.ip().octets());
-        list.push((0x31, locator));
+        list.push((0x31, locator(1, address.port().into(), *address.ip())));
     }
     encapsulated(&list)
+}
+
+fn locator(kind: u32, port: u32, address: Ipv4Addr) -> Vec<u8> {
+    let mut locator = [kind.to_le_bytes(), port.to_le_bytes()].concat();
+    locator.extend([0; 12]);
+    locator.extend(address.octets());
+    locator
+}
+
+/// Returns the SPDP payload of a participant that receives by TCP only.
+pub fn participant_by_tcp(prefix: GuidPrefix, address: SocketAddrV4) -> Vec<u8> {
+    const LOGICAL_PORT: u32 = 7411;
+    let port = LOGICAL_PORT << 16 | u32::from(address.port());
+    let guid = Guid::new(prefix, EntityId::PARTICIPANT);
+    let locator = locator(4, port, *address.ip());
+    encapsulated(&[
+        (0x15, vec![2, 1]),
+        (0x16, vec![1, 0x0f]),
+        (0x50, guid.to_bytes().to_vec()),
+        (0x02, [20u32.to_le_bytes(), [0; 4]].concat()),
+        (0x32, locator.clone()),
+        (0x31, locator),
+    ])
 }
 
 /// Returns the SPDP payload of a participant of Fast DDS with shared memory on this machine, and with
 /// this address.
 pub fn participant_on(prefix: GuidPrefix, machine_id: &str, address: [u8; 4]) -> Vec<u8> {
+    participant_of_version(prefix, machine_id, address, Some([3, 2, 2, 0]))
+}
+
+/// Returns the same payload of this version of Fast DDS; versions before 3.0 announce none.
+pub fn participant_of_version(
+    prefix: GuidPrefix,
+    machine_id: &str,
+    address: [u8; 4],
+    version: Option<[u8; 4]>,
+) -> Vec<u8> {
     let guid = Guid::new(prefix, EntityId::PARTICIPANT);
     let shared_memory = [&16u32.to_le_bytes()[..], &7412u32.to_le_bytes(), &[0; 16]].concat();
     let udp = [
@@ -185,7 +211,7 @@ pub fn participant_on(prefix: GuidPrefix, machine_id: &str, address: [u8; 4]) ->
         &address,
     ]
     .concat();
-    encapsulated(&[
+    let mut list = vec![
         (0x31, udp),
         (0x15, vec![2, 3]),
         (0x16, vec![1, 0x0f]),
@@ -194,7 +220,9 @@ pub fn participant_on(prefix: GuidPrefix, machine_id: &str, address: [u8; 4]) ->
         (0x0f, 0u32.to_le_bytes().to_vec()),
         (0x31, shared_memory),
         (0x8003, text(machine_id)),
-    ])
+    ];
+    list.extend(version.map(|version| (0x8000, version.to_vec())));
+    encapsulated(&list)
 }
 
 /// Returns an SEDP payload.

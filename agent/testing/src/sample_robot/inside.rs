@@ -9,7 +9,7 @@ use ros2probe_model::facts::calls::facts::{
     ObservedProcess, Owner, Publisher, Quantiles, ReaderQueue, Subscription, TopicCounts,
     TopicInside,
 };
-use ros2probe_model::facts::calls::late::{Activity, Cause, LateBound, LateCall, Stage};
+use ros2probe_model::facts::calls::late::{Activity, Cause, LateBound, LateCall, Repairs, Stage};
 use ros2probe_model::facts::calls::other_thread::{OtherThread, Priority, ThreadLabel};
 use ros2probe_model::facts::calls::report::{Durations, ThreadStates, Trigger};
 use ros2probe_model::facts::diagnosis::{Diagnosis, TopicKey};
@@ -190,6 +190,7 @@ fn late(topic: TopicName) -> LateCallback {
         },
         delivery: None,
         handoff: None,
+        repairs: Repairs::default(),
         cpu_limits: Arc::new([]),
         stop: None,
         released_by: None,

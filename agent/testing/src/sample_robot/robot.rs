@@ -1,6 +1,7 @@
 //! What the sample robot itself says, and the clocks of its hosts.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use crate::robot_states::battery;
 use ros2probe_model::derive::clocks::Source as ClockSource;
@@ -87,6 +88,7 @@ pub(super) fn transforms(writer: Guid) -> TransformFacts {
                 }],
                 count: 500,
                 rate: Some(50.0),
+                longest_interval: Some(Duration::from_millis(21)),
                 at: ModelTime::from_nanoseconds(1_699_999_999_000_000_000),
                 stamp: (1_699_999_999, 0),
                 pose: Pose {

@@ -58,6 +58,24 @@ const fn place_of(port: u16) -> Destination {
     }
 }
 
+/// Returns bytes of a connection in one direction.
+fn chunk(flow: Flow, sequence_number: u32, bytes: &[u8]) -> Chunk<'_> {
+    Chunk {
+        time: Timestamp(1),
+        stream: StreamId {
+            flow,
+            ..StreamId::default()
+        },
+        sequence_number,
+        syn: false,
+        end: false,
+        boundary: None,
+        before: MissingBefore::Unknown,
+        bytes,
+        length: bytes.len() as u32,
+    }
+}
+
 /// A connection, of which `passed` bytes were sent in each direction.
 #[derive(Default)]
 struct Connection {
@@ -72,18 +90,8 @@ impl Connection {
         let passed = &mut self.passed[usize::from(there)];
         let length = length as u32;
         let chunk = Chunk {
-            time: Timestamp(1),
-            stream: StreamId {
-                flow,
-                ..StreamId::default()
-            },
-            sequence_number: *passed,
-            syn: false,
-            end: false,
-            boundary: None,
-            before: MissingBefore::Unknown,
-            bytes,
             length,
+            ..chunk(flow, *passed, bytes)
         };
         *passed = passed.wrapping_add(length);
         let read = &mut self.read;
@@ -167,6 +175,42 @@ fn a_connection_that_is_older_than_the_capture_is_read_from_its_next_frame_on() 
     assert_eq!(connection.read, [read(&next, GuidPrefix::UNKNOWN)]);
 }
 
+/// The beginning of a ClientHello of TLS 1.3, as OpenSSL sends it.
+const CLIENT_HELLO: [u8; 12] = [0x16, 3, 1, 0, 0xfa, 1, 0, 0, 0xf6, 3, 3, 0x9c];
+
+#[test]
+fn a_connection_that_begins_with_a_clients_hello_of_tls_is_reported_once() {
+    let mut streams = Streams::default();
+    let mut hellos = Vec::new();
+    let mut pass = |bytes: &[u8], to, number| {
+        let flow = Flow {
+            source: place_of(40_000),
+            destination: place_of(to),
+        };
+        let chunk = Chunk {
+            syn: number == 0,
+            ..chunk(flow, number, bytes)
+        };
+        streams.chunk(&chunk, |streamed| {
+            if let Streamed::ClientHello(flow) = streamed {
+                hellos.push(flow.destination.port);
+            }
+        });
+    };
+    let frame = frame(&message(ONE, b"plain"), PORT);
+    for (to, bytes) in [
+        (5100, &CLIENT_HELLO[..]),
+        (5101, &frame),
+        (7447, &CLIENT_HELLO),
+    ] {
+        pass(&[], to, 0);
+        pass(bytes, to, 1);
+        // Later bytes that look like it are in the middle of the connection.
+        pass(&CLIENT_HELLO, to, 1 + bytes.len() as u32);
+    }
+    assert_eq!(hellos, [5100]);
+}
+
 #[test]
 fn missing_bytes_lose_the_messages_that_contain_them() {
     let mut connection = Connection::default();
@@ -181,7 +225,7 @@ fn missing_bytes_lose_the_messages_that_contain_them() {
     connection.streams.advance(late, |streamed| match streamed {
         Streamed::Message { bytes, .. } => found.push(bytes.to_vec()),
         Streamed::Gap(destination, time) => gaps.push((*destination, *time)),
-        Streamed::Zenoh(_) => panic!("{streamed:?}"),
+        _ => panic!("{streamed:?}"),
     });
     assert_eq!(found, [messages[2].clone()]);
     assert_eq!(gaps, [(place_of(5100), late)]);
@@ -255,21 +299,7 @@ fn frames_beyond_the_byte_cap_lose_their_payload_and_each_direction_stays_synchr
                 1 => (HALF, &large[HALF..]),
                 _ => (2 * HALF, &frame(&next, PORT)[..]),
             };
-            let chunk = Chunk {
-                time: Timestamp(1),
-                stream: StreamId {
-                    flow,
-                    ..StreamId::default()
-                },
-                sequence_number: from as u32,
-                syn: false,
-                end: false,
-                boundary: None,
-                before: MissingBefore::Unknown,
-                bytes,
-                length: bytes.len() as u32,
-            };
-            streams.chunk(&chunk, |streamed| {
+            streams.chunk(&chunk(flow, from as u32, bytes), |streamed| {
                 if let Streamed::Message { bytes, length, .. } = streamed {
                     match **bytes == *next {
                         true => last += 1,

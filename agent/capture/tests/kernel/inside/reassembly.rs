@@ -12,13 +12,19 @@ fn shorten_reassembly_timeout(host: &Namespace) {
     .unwrap();
 }
 
-/// Wait that is longer than this timeout.
-const AFTER_REASSEMBLY_TIMEOUT: Duration = Duration::from_millis(2500);
+/// Returns a link on which datagrams arrive: their fragments need no time of the reassembly
+/// timeout to resolve the address.
+fn ready_link() -> Link {
+    let link = Link::new().unwrap();
+    let of = |host: &Namespace| host.address().to_string();
+    wait_for_link(&link, &of(&link.robot), &of(&link.monitor));
+    link
+}
 
 #[test]
 fn a_datagram_without_its_last_fragment_is_reported() {
     let mut observed = Observed::new();
-    let link = Link::new().unwrap();
+    let link = ready_link();
     shorten_reassembly_timeout(&link.monitor);
     let (mut talker, writer) = talker(1);
     observed
@@ -36,7 +42,7 @@ fn a_datagram_without_its_last_fragment_is_reported() {
     wire.send(&talker.sample(5_000)).unwrap();
     wire.shuffle = |_| {};
     wire.send(&talker.sample(30_000)).unwrap();
-    let found = observed.records(writer, AFTER_REASSEMBLY_TIMEOUT);
+    let found = observed.records_of_lost(writer, 4);
     let mut numbers: Vec<_> = found.iter().map(|record| record.sequence_number).collect();
     numbers.sort_unstable();
     assert_eq!(numbers, [2, 3, 4, 5]);
@@ -63,7 +69,7 @@ fn a_datagram_without_its_last_fragment_is_reported() {
 #[test]
 fn a_datagram_without_its_first_fragment_is_counted_but_not_identified() {
     let mut observed = Observed::new();
-    let link = Link::new().unwrap();
+    let link = ready_link();
     shorten_reassembly_timeout(&link.monitor);
     let (mut talker, writer) = talker(2);
     observed
@@ -76,17 +82,24 @@ fn a_datagram_without_its_first_fragment_is_counted_but_not_identified() {
     for _ in 0..5 {
         wire.send(&talker.sample(30_000)).unwrap();
     }
-    assert_eq!(observed.records(writer, AFTER_REASSEMBLY_TIMEOUT), []);
+    let begun = Instant::now();
+    let unnamed = |observed: &Observed| observed.counted(Counter::NotReassembledUnnamed) - before;
+    let mut found = Vec::new();
+    while unnamed(&observed) < 5 && begun.elapsed() < PATIENCE {
+        found.extend(observed.records(writer, Duration::from_millis(50)));
+    }
+    found.extend(observed.records(writer, SETTLED));
+    assert_eq!(found, []);
     // Parallel tests may lose datagrams at the same time, but not one per fragment.
-    let unnamed = observed.counted(Counter::NotReassembledUnnamed) - before;
-    assert!((5..20).contains(&unnamed), "{unnamed}");
+    let unnamed = unnamed(&observed);
+    assert!((5..100).contains(&unnamed), "{unnamed}");
 }
 
 #[test]
 fn a_datagram_with_fragments_too_far_apart_is_reported_when_given_up() {
     static HELD_DATAGRAMS: Mutex<Vec<Vec<u8>>> = Mutex::new(Vec::new());
     let mut observed = Observed::new();
-    let link = Link::new().unwrap();
+    let link = ready_link();
     shorten_reassembly_timeout(&link.monitor);
     let limit = || std::fs::write("/proc/sys/net/ipv4/ipfrag_max_dist", "2").unwrap();
     netns::within(&link.monitor.network(), limit).unwrap();
@@ -96,6 +109,7 @@ fn a_datagram_with_fragments_too_far_apart_is_reported_when_given_up() {
         .set_interest(writer, Some(Verdict::Meter))
         .unwrap();
     let mut wire = Wire::new(&link.robot, &link.monitor, INTERFACE).unwrap();
+    let begun = Instant::now();
     wire.shuffle = |packets| *HELD_DATAGRAMS.lock().unwrap() = packets.split_off(2);
     wire.send(&talker.sample(20_000)).unwrap();
     wire.shuffle = |packets| packets.truncate(1);
@@ -105,11 +119,16 @@ fn a_datagram_with_fragments_too_far_apart_is_reported_when_given_up() {
     wire.shuffle = |packets| *packets = HELD_DATAGRAMS.lock().unwrap().drain(..).collect();
     wire.send(&talker.sample(20_000)).unwrap();
     let at_once = observed.records(writer, SETTLED);
-    assert_eq!(fragment_numbers(&at_once), FragmentNumbers::from([(1, 0)]));
-    let later = observed.records(writer, AFTER_REASSEMBLY_TIMEOUT);
+    // On a busy machine, others may have reached their timeout by now.
+    if begun.elapsed() < Duration::from_millis(900) {
+        assert_eq!(fragment_numbers(&at_once), FragmentNumbers::from([(1, 0)]));
+    }
+    let missing = 6_usize.saturating_sub(at_once.len());
+    let later = observed.records_of_lost(writer, missing);
+    let all = at_once.iter().chain(&later);
     assert_eq!(
-        fragment_numbers(&later),
-        (2..=6).map(|number| (number, 0)).collect()
+        fragment_numbers(all),
+        (1..=6).map(|number| (number, 0)).collect()
     );
     assert_eq!(at_once.len() + later.len(), 6);
 }
@@ -143,7 +162,7 @@ fn fragments_dropped_for_lack_of_memory_are_reported_immediately() {
             sender.send(&talker.sample(60_000)).unwrap();
             std::thread::sleep(Duration::from_millis(5));
         }
-        let found = observed.records(writer, SETTLED);
+        let found = observed.records_of_lost(writer, 4);
         let lost: Vec<_> = found
             .iter()
             .filter(|record| record.flags & flag::NOT_REASSEMBLED != 0)
@@ -197,7 +216,7 @@ fn an_incomplete_datagram_over_ipv6_or_multicast_is_reported() {
         }
         drop(lossy);
         sender.send(&talker.sample(60_000)).unwrap();
-        let mut found = observed.records(writer, AFTER_REASSEMBLY_TIMEOUT);
+        let mut found = observed.records_of_lost(writer, 3);
         found.retain(|record| record.flags & flag::NOT_REASSEMBLED != 0);
         let expected: FragmentNumbers = (before + 1..before + 4)
             .map(|number| (number.into(), 0))

@@ -5,13 +5,13 @@ use std::fs::File;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
 use std::process::Command;
 use std::thread::sleep;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::Result;
 use ros2probe_capture::filter::{Filter, FilterSettings};
 use ros2probe_capture::netns;
 use ros2probe_capture::system::Clocks;
-use ros2probe_model::facts::calls::late::{Cause, LateCall, Stage};
+use ros2probe_model::facts::calls::late::{Cause, LateCall, Part, Stage};
 use ros2probe_model::facts::calls::report::ThreadStates;
 use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::program_run;
@@ -20,7 +20,7 @@ use ros2probe_wire::filter::Counter;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 
 use super::late::{late, set_bounds};
-use super::thread_states::{Hog, Quota};
+use super::thread_states::{Hog, exhaust, limit_to_five_percent, wait_until_stopped};
 use super::{Process, Robot};
 
 const WRITER: Guid = Guid::new(GuidPrefix(*b"\x01\x0fdeliveries"), EntityId([0, 0, 1, 3]));
@@ -85,14 +85,21 @@ impl DeliveryBench {
             host,
         };
         // The delay of a message is its time beyond the fastest one.
-        for _ in 0..3 {
+        let (mut passes, mut is_fast) = (0, false);
+        while passes < 3 || !is_fast {
+            assert!(passes < 1000, "no message passes fast");
+            let begun = Instant::now();
             way.send(Duration::ZERO)?;
             way.process.run("network 1 0");
+            is_fast |= begun.elapsed() < IMPRECISION / 2;
+            passes += 1;
         }
         set_bounds(&mut way.robot, &way.process);
         // The states of the thread before a call are known from the second call on.
         way.send(Duration::ZERO)?;
         way.process.run("network 1 0");
+        // On a busy machine, this call may be late itself.
+        way.robot.round();
         Ok(way)
     }
 
@@ -123,18 +130,29 @@ impl DeliveryBench {
     }
 }
 
+/// Is true for the time that a thread waits for a CPU of a busy machine.
+pub(super) fn is_busy(part: &Part) -> bool {
+    matches!(part.cause, Cause::Runnable | Cause::Stolen)
+}
+
 /// Asserts that a call is late for this part, and that the part has the injected length or more.
-pub(super) fn assert_late_for(call: &LateCall, stage: Stage, cause: Cause) {
+/// Returns the part. On a busy machine, the process may wait for a CPU for even longer.
+pub(super) fn assert_late_for(call: &LateCall, stage: Stage, cause: Cause) -> Part {
     let parts = call.parts();
     let sum: Duration = parts.iter().map(|part| part.duration).sum();
     assert_eq!(sum, call.total(), "{call:#?}");
     let main = call.main_part(ThreadStates::default()).unwrap();
-    assert_eq!(
-        (main.stage, main.cause),
-        (stage, cause),
+    let is_injected = |part: &Part| (part.stage, part.cause) == (stage, cause);
+    // While the thread waits for a CPU, the message waits in its socket.
+    let is_later = is_busy(&main) || main.cause == Cause::Queue;
+    assert!(is_injected(&main) || is_later, "{parts:?} {call:#?}");
+    let injected = parts.iter().find(|part| is_injected(part)).copied();
+    let injected = injected.unwrap_or_else(|| panic!("{parts:?} {call:#?}"));
+    assert!(
+        injected.duration >= LATE - IMPRECISION,
         "{parts:?} {call:#?}"
     );
-    assert!(main.duration >= LATE - IMPRECISION, "{parts:?} {call:#?}");
+    injected
 }
 
 /// Asserts that a message that no thread receives is late for that reason.
@@ -181,7 +199,20 @@ fn a_message_that_the_middleware_keeps_names_the_middleware() -> Result<()> {
     let mut way = DeliveryBench::new()?;
     way.send(Duration::ZERO)?;
     let call = way.receive(&format!("network 1 {}", LATE.as_micros()));
-    assert_late_for(&call, Stage::Wait, Cause::Middleware);
+    let parts = call.parts();
+    let (busy, own): (Vec<Part>, Vec<Part>) = parts.iter().copied().partition(is_busy);
+    let main = own.iter().max_by_key(|part| part.duration).unwrap();
+    assert_eq!(
+        (main.stage, main.cause),
+        (Stage::Wait, Cause::Middleware),
+        "{parts:?} {call:#?}"
+    );
+    // The wait for a CPU on a busy machine is no part of the middleware's time.
+    let busy: Duration = busy.iter().map(|part| part.duration).sum();
+    assert!(
+        main.duration + busy >= LATE - IMPRECISION,
+        "{parts:?} {call:#?}"
+    );
     Ok(())
 }
 
@@ -228,6 +259,7 @@ fn a_stopped_process_is_the_cause_of_a_wait_in_its_socket() -> Result<()> {
     way.process.begin("network 5 0");
     sleep(Duration::from_millis(20));
     signal("-STOP")?;
+    wait_until_stopped(&way.process);
     for _ in 0..5 {
         way.send(Duration::ZERO)?;
     }
@@ -237,8 +269,8 @@ fn a_stopped_process_is_the_cause_of_a_wait_in_its_socket() -> Result<()> {
     let calls = way.robot.round().report.late;
     assert_eq!(calls.len(), 5, "{calls:#?}");
     for call in &calls {
-        assert_late_for(call, Stage::Socket, Cause::Stopped);
-        let named = call.named_by(call.main_part(ThreadStates::default()).unwrap());
+        let stopped = assert_late_for(call, Stage::Socket, Cause::Stopped);
+        let named = call.named_by(stopped);
         assert!(
             named.is_some_and(|thread| &*thread.name == "kill"),
             "{named:?}"
@@ -254,9 +286,9 @@ fn a_quota_is_the_cause_of_the_waits_of_messages() -> Result<()> {
     const MESSAGES: usize = 60;
     way.process.begin(&format!("network {MESSAGES} 0"));
     sleep(Duration::from_millis(20));
-    let quota = Quota::limit_to_five_percent(&way.process);
+    let quota = limit_to_five_percent(&way.process);
     let hog = Hog::on("0-1");
-    quota.exhaust(&hog);
+    exhaust(&quota, &hog);
     for _ in 0..MESSAGES {
         way.send(Duration::ZERO)?;
         sleep(Duration::from_millis(15));
@@ -268,14 +300,15 @@ fn a_quota_is_the_cause_of_the_waits_of_messages() -> Result<()> {
     let mains = calls
         .iter()
         .map(|call| call.main_part(ThreadStates::default()).unwrap());
+    // On a busy machine, other threads make some messages late.
+    let mains: Vec<_> = mains.filter(|main| !is_busy(main)).collect();
     // Since Linux 6.18, a thread is throttled at the end of its system call.
-    let throttled = mains.filter(|main| {
+    let throttled = mains.iter().filter(|main| {
         let is_in_process = matches!(main.stage, Stage::Socket | Stage::Wait);
         is_in_process && main.cause == Cause::Throttled
     });
-    // On a busy machine, other threads make some messages late.
     let throttled = throttled.count();
-    assert!(throttled > 0 && throttled * 2 >= calls.len(), "{calls:#?}");
+    assert!(throttled > 0 && throttled * 2 >= mains.len(), "{calls:#?}");
     Ok(())
 }
 

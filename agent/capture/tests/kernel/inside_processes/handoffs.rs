@@ -4,15 +4,16 @@
 use std::fs;
 use std::process::Command;
 use std::thread::sleep;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use ros2probe_model::facts::calls::late::{Cause, LateCall, Stage};
+use ros2probe_model::facts::calls::late::{Cause, LateCall, Part, Stage};
+use ros2probe_model::facts::calls::other_thread::OtherThread;
 use ros2probe_model::facts::calls::report::ThreadStates;
 use tempfile::NamedTempFile;
 
-use super::deliveries::{LATE, assert_late_for};
-use super::late::set_bounds;
-use super::thread_states::{Hog, Quota};
+use super::deliveries::{LATE, assert_late_for, is_busy};
+use super::late::{MAX_NAMED_THREADS, set_bounds};
+use super::thread_states::{Hog, exhaust, limit_to_five_percent, wait_until_stopped};
 use super::{Process, Robot};
 
 /// A subscriber with a thread of the middleware, and a publisher that shares memory with it.
@@ -47,8 +48,13 @@ impl Subscriber {
             port,
         };
         // The delay of a message is its time beyond the fastest one.
-        for _ in 0..3 {
+        let (mut passes, mut is_fast) = (0, false);
+        while passes < 3 || !is_fast {
+            assert!(passes < 1000, "no message passes fast");
+            let begun = Instant::now();
             subscriber.pass(Duration::ZERO);
+            is_fast |= begun.elapsed() < LATE / 5;
+            passes += 1;
         }
         set_bounds(&mut subscriber.robot, &subscriber.process);
         // The executor's thread is followed from its first call on, then the listener.
@@ -118,8 +124,8 @@ fn a_message_that_is_put_late_into_shared_memory_names_the_publisher() {
     let mut subscriber = Subscriber::new();
     subscriber.pass(LATE);
     let call = subscriber.one_late_call();
-    assert_late_for(&call, Stage::Publish, Cause::Send);
-    let named = call.named_by(call.main_part(ThreadStates::default()).unwrap());
+    let late = assert_late_for(&call, Stage::Publish, Cause::Send);
+    let named = call.named_by(late);
     assert_eq!(
         named.map(|it| it.process),
         Some(subscriber.publisher.child.id()),
@@ -148,6 +154,17 @@ fn a_message_that_the_middleware_passes_on_late_names_the_middleware() {
     assert_late_for(&call, Stage::Receive, Cause::Middleware);
 }
 
+/// Is true if the thread of the middleware waited for a CPU for most of the message's wait.
+fn waited_for_the_receiver(call: &&LateCall) -> bool {
+    let receiver = call
+        .handoff
+        .as_ref()
+        .map(|handoff| handoff.receiver.runnable);
+    call.wait
+        .zip(receiver)
+        .is_some_and(|(all, receiver)| receiver * 2 > all)
+}
+
 #[test]
 fn a_delayed_wakeup_names_the_thread_that_ran_instead() {
     let mut subscriber = Subscriber::new();
@@ -161,32 +178,30 @@ fn a_delayed_wakeup_names_the_thread_that_ran_instead() {
         assert!(output.status.success(), "{output:?}");
     }
     let _hogs = [Hog::on("0"), Hog::on("0")];
-    for _ in 0..20 {
-        subscriber.process.begin("shared 1 0");
-        subscriber.send_to_waiting(Duration::ZERO);
-        subscriber.process.end("shared");
-    }
-    let calls = subscriber.robot.round().report.late;
-    // On a busy machine, the executor's thread sometimes waits longer for a CPU than this one.
-    let waited = calls.iter().filter(|call| {
-        let receiver = call
-            .handoff
-            .as_ref()
-            .map(|handoff| handoff.receiver.runnable);
-        call.wait
-            .zip(receiver)
-            .is_some_and(|(all, receiver)| receiver * 2 > all)
-    });
-    let waited: Vec<_> = waited.collect();
-    assert!(waited.len() >= 5, "{calls:#?}");
+    let mut calls = Vec::new();
+    // On a busy machine, the executor's thread sometimes waits longer for a CPU than this one. And
+    // while other programs take this CPU from both loops, the thread often runs at once.
+    let begun = Instant::now();
+    let waited = loop {
+        for _ in 0..5 {
+            subscriber.pass(Duration::ZERO);
+        }
+        calls.extend(subscriber.robot.round().report.late);
+        let waited: Vec<_> = calls.iter().filter(waited_for_the_receiver).collect();
+        if waited.len() >= 12 {
+            break waited;
+        }
+        assert!(begun.elapsed() < Duration::from_secs(60), "{calls:#?}");
+    };
     // So may programs of others take this CPU: then one of them ran longer than both loops.
+    let is_full = |others: &[OtherThread]| others.len() == MAX_NAMED_THREADS;
     let is_named = |call: &&&LateCall| {
         let main = call.main_part(ThreadStates::default()).unwrap();
         let named = call.named_by(main);
         let others = &call.handoff.as_ref().unwrap().others;
         let longest = others.iter().map(|other| other.duration).max();
         (main.stage, main.cause) == (Stage::Receive, Cause::Runnable)
-            && others.iter().any(|other| &*other.name == "sh")
+            && (is_full(others) || others.iter().any(|other| &*other.name == "sh"))
             && named.is_some_and(|thread| Some(thread.duration) == longest)
     };
     let named = waited.iter().filter(is_named).count();
@@ -196,9 +211,9 @@ fn a_delayed_wakeup_names_the_thread_that_ran_instead() {
 #[test]
 fn a_message_for_a_process_beyond_its_quota_is_throttled() {
     let mut subscriber = Subscriber::new();
-    let quota = Quota::limit_to_five_percent(&subscriber.process);
+    let quota = limit_to_five_percent(&subscriber.process);
     let hog = Hog::on("0-1");
-    quota.exhaust(&hog);
+    exhaust(&quota, &hog);
     const MESSAGES: usize = 30;
     subscriber.process.begin(&format!("shared {MESSAGES} 0"));
     for _ in 0..MESSAGES {
@@ -212,8 +227,11 @@ fn a_message_for_a_process_beyond_its_quota_is_throttled() {
     let mains = calls
         .iter()
         .map(|call| call.main_part(ThreadStates::default()).unwrap());
-    let throttled = mains.filter(|main| main.cause == Cause::Throttled).count();
-    assert!(throttled > 0 && throttled * 2 >= calls.len(), "{calls:#?}");
+    // On a busy machine, other threads make some messages late.
+    let mains: Vec<_> = mains.filter(|main| !is_busy(main)).collect();
+    let is_throttled = |main: &&Part| main.cause == Cause::Throttled;
+    let throttled = mains.iter().filter(is_throttled).count();
+    assert!(throttled > 0 && throttled * 2 >= mains.len(), "{calls:#?}");
 }
 
 #[test]
@@ -226,6 +244,7 @@ fn a_stopped_process_is_the_cause_of_a_wait_in_shared_memory() {
     let process = subscriber.process.child.id().cast_signed();
     // SAFETY: signals a child of this test.
     unsafe { libc::kill(process, libc::SIGSTOP) };
+    wait_until_stopped(&subscriber.process);
     subscriber.send(Duration::ZERO);
     sleep(LATE);
     // SAFETY: as above.
@@ -233,13 +252,15 @@ fn a_stopped_process_is_the_cause_of_a_wait_in_shared_memory() {
     subscriber.process.end("shared");
     let call = subscriber.one_late_call();
     // After SIGCONT, either of the two threads can be the first to see the message.
-    let main = call.main_part(ThreadStates::default()).unwrap();
-    assert_late_for(&call, main.stage, Cause::Stopped);
+    let parts = call.parts().into_iter();
+    let stopped = parts.filter(|part| part.cause == Cause::Stopped);
+    let stopped = stopped.max_by_key(|part| part.duration).unwrap();
+    assert_late_for(&call, stopped.stage, Cause::Stopped);
     assert!(
-        matches!(main.stage, Stage::Receive | Stage::Wait),
+        matches!(stopped.stage, Stage::Receive | Stage::Wait),
         "{call:#?}"
     );
-    let named = call.named_by(main);
+    let named = call.named_by(stopped);
     assert_eq!(
         named.map(|it| it.process),
         Some(std::process::id()),

@@ -1,25 +1,29 @@
 //! Late calls, each with an injected cause.
 
 use std::process::Command;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
+use std::sync::{Arc, mpsc};
+use std::time::{Duration, Instant};
 
-use ros2probe_model::facts::calls::late::{Cause, LateCall, Part, Stage};
+use ros2probe_model::facts::calls::late::{Cause, LateCall, Stage};
 use ros2probe_model::facts::calls::other_thread::Priority;
 use ros2probe_model::facts::calls::report::{ThreadStates, Trigger};
 use ros2probe_testing::harness::cgroup::Cgroup;
 use ros2probe_wire::inside::late::{Bound, PER_SECOND, THREAD_CAPACITY, mode};
 use ros2probe_wire::inside::{Counter, Handle, kind};
 
-use super::thread_states::{Hog, Quota};
+use super::deliveries::is_busy;
+use super::thread_states::{Hog, limit_to_five_percent};
 use super::{Process, Robot};
 
 /// Calls that take longer are late.
 const BOUND: Duration = Duration::from_millis(5);
 
+/// Time after which a busy machine has shown enough calls.
+pub(super) const PATIENCE: Duration = Duration::from_secs(60);
+
 /// Maximum number of threads that are named for a span of a late call.
-const MAX_NAMED_THREADS: usize = 4;
+pub(super) const MAX_NAMED_THREADS: usize = 4;
 
 /// A process whose late calls are observed, by the scheduler's events.
 pub(super) fn started() -> (Robot, Process) {
@@ -61,18 +65,17 @@ pub(super) fn late(robot: &mut Robot, process: &mut Process, command: &str) -> V
     robot.round().report.late
 }
 
-/// Returns the calls whose events are complete: on a busy machine the kernel may skip an event of one
-/// of ten.
+/// Is true if the kernel has skipped no event of the call.
+pub(super) fn is_complete(call: &LateCall) -> bool {
+    let activity = call.activity.as_ref();
+    activity.is_none_or(|activity| activity.missed_events == 0)
+}
+
+/// Returns the calls whose events are complete: on a busy machine the kernel may skip an event of
+/// some of them.
 fn complete(calls: &[LateCall]) -> Vec<&LateCall> {
-    let has_all = |call: &&LateCall| {
-        let activity = call.activity.as_ref();
-        activity.is_none_or(|activity| activity.missed_events == 0)
-    };
-    let complete: Vec<_> = calls.iter().filter(has_all).collect();
-    assert!(
-        calls.len() - complete.len() <= calls.len().div_ceil(10),
-        "{calls:#?}"
-    );
+    let complete: Vec<_> = calls.iter().filter(|call| is_complete(call)).collect();
+    assert!(complete.len() * 2 > calls.len(), "{calls:#?}");
     complete
 }
 
@@ -84,10 +87,9 @@ fn assert_cause(calls: &[LateCall], number: usize, cause: Cause, share: f64) {
         let parts = call.parts();
         let sum: Duration = parts.iter().map(|part| part.duration).sum();
         assert_eq!(sum, call.total(), "{call:#?}");
-        let is_busy = |part: &&Part| matches!(part.cause, Cause::Runnable | Cause::Stolen);
         let named = call.main_part(ThreadStates::default()).unwrap();
         assert!(
-            named.cause == cause || is_busy(&&named),
+            named.cause == cause || is_busy(&named),
             "{parts:?} {call:#?}"
         );
         let own: Vec<_> = parts.iter().filter(|part| !is_busy(part)).collect();
@@ -120,7 +122,7 @@ fn a_call_that_computes_names_no_one() {
         let main = call.main_part(ThreadStates::default()).unwrap();
         // On a busy machine another thread may run instead.
         assert!(
-            matches!(main.cause, Cause::Cpu | Cause::Runnable),
+            matches!(main.cause, Cause::Cpu | Cause::Runnable | Cause::Stolen),
             "{call:#?}"
         );
     }
@@ -160,27 +162,36 @@ fn a_call_beside_a_thread_of_another_process_names_that_process() {
     pin(&process);
     let is_over = Arc::new(AtomicBool::new(false));
     let until = Arc::clone(&is_over);
+    let (pinned, is_pinned) = mpsc::channel();
     let hog = std::thread::spawn(move || {
         // SAFETY: no preconditions.
         let thread = unsafe { libc::gettid() };
         let arguments = ["-pc", "0", &thread.to_string()];
-        let pinned = Command::new("taskset").args(arguments).output();
-        assert!(pinned.unwrap().status.success());
+        let output = Command::new("taskset").args(arguments).output();
+        assert!(output.unwrap().status.success());
+        pinned.send(thread.cast_unsigned()).unwrap();
         while !until.load(Ordering::Relaxed) {}
-        thread.cast_unsigned()
     });
-    let calls = late(&mut robot, &mut process, "compute 10 60000");
+    let thread = is_pinned.recv().unwrap();
+    let begun = Instant::now();
+    // On a busy machine, further threads of this CPU may be the longest ones.
+    loop {
+        let calls = late(&mut robot, &mut process, "compute 10 60000");
+        let others = calls
+            .iter()
+            .flat_map(|call| &call.activity.as_ref().unwrap().others);
+        let hogs: Vec<_> = others.filter(|other| other.thread == thread).collect();
+        assert!(
+            hogs.iter().all(|hog| hog.process == std::process::id()),
+            "{calls:#?}"
+        );
+        if !hogs.is_empty() {
+            break;
+        }
+        assert!(begun.elapsed() < PATIENCE, "{calls:#?}");
+    }
     is_over.store(true, Ordering::Relaxed);
-    let thread = hog.join().unwrap();
-    let others = calls
-        .iter()
-        .flat_map(|call| &call.activity.as_ref().unwrap().others);
-    let mut hog = others.filter(|other| other.thread == thread).peekable();
-    assert!(hog.peek().is_some(), "{calls:#?}");
-    assert!(
-        hog.all(|other| other.process == std::process::id()),
-        "{calls:#?}"
-    );
+    hog.join().unwrap();
 }
 
 #[test]
@@ -207,10 +218,29 @@ fn a_call_that_waits_for_a_lock_names_its_holder() {
     let unit = Cgroup::create(&name).unwrap();
     let id = process.child.id().to_string();
     std::fs::write(unit.path().join("cgroup.procs"), id).unwrap();
-    let calls = late(&mut robot, &mut process, "lock 10 30000");
-    assert!(calls.len() >= 8, "{calls:#?}");
-    assert_cause(&calls, calls.len(), Cause::Lock, 0.3);
-    for call in &calls {
+    let waits_for_lock = |call: &LateCall| {
+        let mut parts = call.parts().into_iter();
+        parts.any(|part| part.cause == Cause::Lock && part.duration >= BOUND)
+    };
+    let begun = Instant::now();
+    let mut calls: Vec<LateCall> = Vec::new();
+    // On a busy machine, the process may lose its CPU between the holder's lock and its own.
+    let held = loop {
+        calls.extend(late(&mut robot, &mut process, "lock 10 30000"));
+        let complete = calls.iter().filter(|call| is_complete(call));
+        let (held, free): (Vec<LateCall>, Vec<LateCall>) =
+            complete.cloned().partition(waits_for_lock);
+        for call in free {
+            let main = call.main_part(ThreadStates::default()).unwrap();
+            assert!(is_busy(&main), "{call:#?}");
+        }
+        if held.len() >= 8 {
+            break held;
+        }
+        assert!(begun.elapsed() < PATIENCE, "{calls:#?}");
+    };
+    assert_cause(&held, held.len(), Cause::Lock, 0.3);
+    for call in &held {
         let activity = call.activity.as_ref().unwrap();
         let longest = activity.longest.as_ref().unwrap();
         assert_eq!(longest.call.as_deref(), Some("futex"), "{call:#?}");
@@ -257,7 +287,7 @@ fn a_call_that_waits_for_its_pages_is_named_so() {
 fn a_stopped_call_names_the_thread_that_continued_it() {
     let (mut robot, mut process) = started();
     let id = process.child.id().cast_signed();
-    let stop = std::thread::spawn(move || {
+    let stop = move || {
         for _ in 0..10 {
             std::thread::sleep(Duration::from_millis(30));
             // SAFETY: signals a child of this test.
@@ -266,41 +296,68 @@ fn a_stopped_call_names_the_thread_that_continued_it() {
             // SAFETY: as above.
             unsafe { libc::kill(id, libc::SIGCONT) };
         }
-    });
-    let calls = late(&mut robot, &mut process, "compute 10 80000");
-    stop.join().unwrap();
-    let stopped = |call: &&LateCall| {
+    };
+    let is_stopped = |call: &&LateCall| {
         let longest = call.activity.as_ref().unwrap().longest.as_ref();
         let waker = longest.and_then(|longest| longest.waker.as_ref());
-        waker.is_some_and(|waker| waker.process == std::process::id())
-    };
-    let stopped: Vec<_> = calls.iter().filter(stopped).collect();
-    assert!(stopped.len() >= 4, "{calls:#?}");
-    for call in stopped {
         let mut parts = call.parts().into_iter();
-        let part = parts.find(|part| part.cause == Cause::Stopped).unwrap();
-        assert!(part.duration >= Duration::from_millis(20), "{call:#?}");
+        let part = parts.find(|part| part.cause == Cause::Stopped);
+        waker.is_some_and(|waker| waker.process == std::process::id())
+            && part.is_some_and(|part| part.duration >= Duration::from_millis(20))
+    };
+    let begun = Instant::now();
+    let mut calls: Vec<LateCall> = Vec::new();
+    // On a busy machine, a stopped process may wait longer for a CPU than for its signal.
+    loop {
+        let stops = std::thread::spawn(stop);
+        calls.extend(late(&mut robot, &mut process, "compute 10 80000"));
+        stops.join().unwrap();
+        if calls.iter().filter(is_stopped).count() >= 4 {
+            return;
+        }
+        assert!(begun.elapsed() < PATIENCE, "{calls:#?}");
     }
 }
 
 #[test]
 fn a_call_beyond_the_quota_of_its_control_group_is_throttled() {
     let (mut robot, mut process) = started();
-    let _quota = Quota::limit_to_five_percent(&process);
+    let _quota = limit_to_five_percent(&process);
     let calls = late(&mut robot, &mut process, "compute 5 200000");
-    assert_cause(&calls, 5, Cause::Throttled, 0.4);
+    assert_eq!(calls.len(), 5, "{calls:#?}");
+    // On a busy machine, a call that gets no CPU in all its time uses up no quota.
+    let is_throttled = |call: &LateCall| {
+        let mut parts = call.parts().into_iter();
+        parts.any(|part| part.cause == Cause::Throttled)
+    };
+    let (throttled, others): (Vec<LateCall>, Vec<LateCall>) =
+        calls.into_iter().partition(is_throttled);
+    assert!(!throttled.is_empty(), "{others:#?}");
+    assert_cause(&throttled, throttled.len(), Cause::Throttled, 0.4);
+    for call in others {
+        let main = call.main_part(ThreadStates::default()).unwrap();
+        assert!(is_busy(&main), "{call:#?}");
+    }
 }
 
 #[test]
 fn a_call_that_waits_for_another_callback_names_it() {
     let (mut robot, mut process) = started();
-    process.run("enqueue 3");
-    let calls = late(&mut robot, &mut process, "receive 3 30000");
+    // On a busy machine, the process would wait for the second command.
+    process.begin("enqueue 3");
+    process.begin("receive 3 30000");
+    process.end("enqueue");
+    process.end("receive");
+    let calls = robot.round().report.late;
     assert_eq!(calls.len(), 3, "{calls:#?}");
     for (index, call) in (0..).zip(&calls) {
         let main = call.main_part(ThreadStates::default()).unwrap();
         if index == 0 {
-            assert_eq!(main.stage, Stage::Callback, "{call:#?}");
+            let is_short = call.wait.is_none_or(|wait| wait < call.duration / 4);
+            assert!(!is_short || main.stage == Stage::Callback, "{call:#?}");
+            let mut parts = call.parts().into_iter();
+            let has_other = parts.any(|part| part.cause == Cause::OtherCallback);
+            assert!(!has_other, "{call:#?}");
             continue;
         }
         let mut parts = call.parts().into_iter();
@@ -324,17 +381,24 @@ fn a_call_that_waits_for_a_callback_of_another_thread_names_it() {
     set_bounds(&mut robot, &process);
     process.run("group 2 1");
     robot.round();
-    let calls = late(&mut robot, &mut process, "group 5 60000");
-    let of_messages = |call: &&LateCall| matches!(call.trigger, Trigger::Subscription(_));
-    let calls: Vec<_> = calls.iter().filter(of_messages).cloned().collect();
-    assert_eq!(calls.len(), 5, "{calls:#?}");
+    let of_messages = |call: &LateCall| matches!(call.trigger, Trigger::Subscription(_));
     let is_named = |call: &&LateCall| {
         let main = call.main_part(ThreadStates::default());
         main.is_some_and(|main| main.cause == Cause::OtherCallback)
     };
     // On a busy machine, the other thread may wait for a CPU before it wakes this one.
-    let named: Vec<_> = calls.iter().filter(is_named).collect();
-    assert!(named.len() >= 3, "{calls:#?}");
+    let begun = Instant::now();
+    let mut all: Vec<LateCall> = Vec::new();
+    let named: Vec<_> = loop {
+        let mut calls = late(&mut robot, &mut process, "group 5 60000");
+        calls.retain(of_messages);
+        assert_eq!(calls.len(), 5, "{calls:#?}");
+        all.extend(calls);
+        if all.iter().filter(is_named).count() >= 3 {
+            break all.iter().filter(is_named).collect();
+        }
+        assert!(begun.elapsed() < PATIENCE, "{all:#?}");
+    };
     for call in named {
         assert_eq!(call.thread, id, "{call:#?}");
         let other = call.waited_for().unwrap();
@@ -351,7 +415,7 @@ fn a_thread_is_followed_again_after_more_threads_than_the_cap() {
     robot.round();
     let calls = late(&mut robot, &mut process, "sleep 10 20000");
     assert_eq!(calls.len(), 10, "{calls:#?}");
-    for call in &calls {
+    for call in complete(&calls) {
         let longest = call.activity.as_ref().unwrap().longest.as_ref().unwrap();
         assert_eq!(longest.call.as_deref(), Some("clock_nanosleep"));
     }
@@ -396,7 +460,7 @@ fn measure_the_causes_of_a_hundred_calls_each() {
         if hog.is_some() {
             pin(&process);
         }
-        let _quota = is_beside("quota").then(|| Quota::limit_to_five_percent(&process));
+        let _quota = is_beside("quota").then(|| limit_to_five_percent(&process));
         let (mut all, mut right, mut named) = (0, 0, 0);
         let mut truth = [Duration::ZERO; 2];
         let mut measured = [Duration::ZERO; 2];

@@ -1,11 +1,11 @@
 //! What the time of callbacks consists of, compared with the kernel's own figures of the process.
 
 use std::fs;
-use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 use ros2probe_model::facts::calls::report::ThreadStates;
+use ros2probe_testing::harness::quota::Quota;
 
 use super::{Process, Robot};
 
@@ -65,63 +65,28 @@ impl Drop for Hog {
     }
 }
 
-/// A control group with a quota of its CPU time, by either version of the hierarchy.
-pub(super) struct Quota(PathBuf);
-
-impl Quota {
-    /// Lets the process run for a twentieth of each 100 ms.
-    pub(super) fn limit_to_five_percent(process: &Process) -> Self {
-        let name = format!("r2p-quota-{}", process.child.id());
-        let first = PathBuf::from("/sys/fs/cgroup/cpu");
-        let (group, limits): (_, &[_]) = if first.join("cpu.cfs_quota_us").exists() {
-            let limits = &[
-                ("cpu.cfs_period_us", "100000"),
-                ("cpu.cfs_quota_us", "5000"),
-            ];
-            (first.join(name), limits)
-        } else {
-            let root = PathBuf::from("/sys/fs/cgroup");
-            let _ = std::fs::write(root.join("cgroup.subtree_control"), "+cpu");
-            (root.join(name), &[("cpu.max", "5000 100000")])
-        };
-        std::fs::create_dir(&group).unwrap();
-        let quota = Self(group);
-        for (file, limit) in limits {
-            let written = std::fs::write(quota.0.join(file), limit);
-            written.expect("a kernel with CPU quotas (CONFIG_CFS_BANDWIDTH)");
-        }
-        let id = process.child.id().to_string();
-        std::fs::write(quota.0.join("cgroup.procs"), id).unwrap();
-        quota
-    }
-
-    /// Adds a thread that computes, so that the quota is always used up.
-    pub(super) fn exhaust(&self, hog: &Hog) {
-        std::fs::write(self.0.join("cgroup.procs"), hog.0.id().to_string()).unwrap();
-    }
-
-    /// Returns how long the kernel has throttled the group.
-    fn throttled(&self) -> Duration {
-        let text = std::fs::read_to_string(self.0.join("cpu.stat")).unwrap();
-        let of = |name| {
-            let mut lines = text.lines().filter_map(|line| line.split_once(' '));
-            let value = lines.find(|(field, _)| *field == name)?.1;
-            Some(value.parse::<u64>().unwrap())
-        };
-        let nanoseconds = of("throttled_time").map(Duration::from_nanos);
-        let microseconds = || of("throttled_usec").map(Duration::from_micros);
-        nanoseconds.or_else(microseconds).unwrap()
-    }
+/// Lets the process run for a twentieth of each 100 ms.
+pub(super) fn limit_to_five_percent(process: &Process) -> Quota {
+    Quota::limit(process.child.id(), 5).unwrap()
 }
 
-impl Drop for Quota {
-    fn drop(&mut self) {
-        let id = std::fs::read_to_string(self.0.join("cgroup.procs")).unwrap_or_default();
-        for id in id.split_whitespace() {
-            let root = self.0.with_file_name("cgroup.procs");
-            let _ = std::fs::write(root, id);
-        }
-        let _ = std::fs::remove_dir(&self.0);
+/// Adds a thread that computes to a group, so that the quota is always used up.
+pub(super) fn exhaust(quota: &Quota, hog: &Hog) {
+    quota.add(hog.0.id()).unwrap();
+}
+
+/// Waits until each thread of the process has stopped: each one does so when it has a CPU.
+pub(super) fn wait_until_stopped(process: &Process) {
+    let begun = Instant::now();
+    let is_stopped = |task: fs::DirEntry| {
+        let stat = fs::read_to_string(task.path().join("stat")).unwrap_or_default();
+        stat.rsplit_once(") ")
+            .is_some_and(|(_, fields)| fields.starts_with('T'))
+    };
+    let tasks = format!("/proc/{}/task", process.child.id());
+    while !fs::read_dir(&tasks).unwrap().flatten().all(is_stopped) {
+        assert!(begun.elapsed() < Duration::from_secs(60), "not stopped");
+        std::thread::sleep(Duration::from_millis(1));
     }
 }
 
@@ -191,10 +156,10 @@ fn a_callback_beside_a_busy_thread_is_runnable_for_as_long_as_the_kernel_counts(
 #[test]
 fn a_callback_beyond_the_quota_of_its_control_group_is_throttled() {
     let (mut robot, mut process) = started();
-    let quota = Quota::limit_to_five_percent(&process);
-    let before = quota.throttled();
+    let quota = limit_to_five_percent(&process);
+    let before = quota.throttled().unwrap();
     let (states, schedstat) = run(&mut robot, &mut process, "compute 3 300000");
-    let throttled = quota.throttled() - before;
+    let throttled = quota.throttled().unwrap() - before;
     assert!(throttled > Duration::from_millis(100), "{states:?}");
     assert_close(states.throttled, throttled, states);
     assert_close(states.cpu, schedstat.cpu, states);

@@ -47,7 +47,9 @@ fn tls_and_other_versions_are_reported_only_on_a_port_of_zenoh() -> Result<()> {
             for _ in 0..10 {
                 pass(&mut connection, true, &random(3, 5000))?;
             }
-            let seen = observed.seen();
+            let chunks = observed.chunks();
+            assert!(ends || chunks.iter().all(|(_, bytes)| bytes.is_empty()));
+            let seen = observed.read(chunks);
             let [out, ..] = directions(&seen, &connection)?;
             assert_eq!(out.is_some(), ends, "{port} {is_tls}");
             let Some(out) = out else { continue };
@@ -60,6 +62,32 @@ fn tls_and_other_versions_are_reported_only_on_a_port_of_zenoh() -> Result<()> {
             assert!(ended >= 1, "the end of a connection that cannot be read");
         }
     }
+    Ok(())
+}
+
+#[test]
+fn of_a_clients_hello_on_another_port_the_addresses_are_passed_on_and_no_byte() -> Result<()> {
+    let mut observed = Observed::new()?;
+    let client = b"\x16\x03\x01\x00\x20\x01\x00\x00\x1c\x03\x03".as_slice();
+    let server = b"\x16\x03\x03\x00\x20\x02\x00\x00\x1c\x03\x03".as_slice();
+    let mut connection = observed.connect("127.0.0.1:0")?;
+    let [from, to] = [connection[0].local_addr()?, connection[1].local_addr()?];
+    pass(&mut connection, true, client)?;
+    pass(&mut connection, false, server)?;
+    pass(&mut connection, true, &random(5, 5000))?;
+    let chunks = observed.chunks();
+    let [(piece, bytes)] = &chunks[..] else {
+        panic!("{chunks:?}")
+    };
+    assert_ne!(piece.chunk & chunk::CLIENT_HELLO, 0);
+    assert_eq!(
+        (piece.source_port, piece.destination_port),
+        (from.port(), to.port())
+    );
+    assert_eq!(
+        (piece.datagram_len as usize, bytes.len()),
+        (client.len(), 0)
+    );
     Ok(())
 }
 

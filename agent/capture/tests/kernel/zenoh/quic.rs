@@ -78,7 +78,7 @@ fn quic_on_interfaces_is_reported_only_on_a_port_of_zenoh() -> Result<()> {
         for (port, bytes, is_quic) in datagrams() {
             let mut tapped = Tapped::new(wire)?;
             netns::within(&tapped.host.network(), || exchange(address, port, &bytes))??;
-            let deadline = Instant::now() + Duration::from_secs(if is_quic { 5 } else { 1 });
+            let deadline = Instant::now() + Duration::from_secs(if is_quic { 60 } else { 1 });
             let mut facts = None;
             while facts.is_none() && Instant::now() < deadline {
                 std::thread::sleep(Duration::from_millis(20));

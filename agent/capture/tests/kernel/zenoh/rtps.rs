@@ -85,7 +85,7 @@ fn frames(capture: &str) -> Result<Vec<Vec<Sent>>> {
 }
 
 /// A DATA of a writer, with an INFO_TS before and a HEARTBEAT after it.
-fn data(prefix: GuidPrefix, writer: EntityId, payload: &[u8]) -> Vec<u8> {
+pub(super) fn data(prefix: GuidPrefix, writer: EntityId, payload: &[u8]) -> Vec<u8> {
     let mut message = b"RTPS\x02\x03\x01\x0f".to_vec();
     message.extend(prefix.0);
     message.extend([9, 1, 8, 0, 1, 0, 0, 0, 2, 0, 0, 0]);

@@ -40,9 +40,18 @@ impl Tapped {
         netns::within(&self.host.network(), || connect(address))?
     }
 
-    /// Reads until this many batches were read, or for at most five seconds.
+    /// Reads until this many batches were read, or for at most a minute.
     fn read(&mut self, batches: u64, at_sockets: Option<&Streams>) -> Result<u64> {
-        let deadline = Instant::now() + Duration::from_secs(5);
+        self.read_within(Duration::from_secs(60), batches, at_sockets)
+    }
+
+    fn read_within(
+        &mut self,
+        limit: Duration,
+        batches: u64,
+        at_sockets: Option<&Streams>,
+    ) -> Result<u64> {
+        let deadline = Instant::now() + limit;
         while self.tap.streams().counters().batches < batches && Instant::now() < deadline {
             std::thread::sleep(Duration::from_millis(20));
             self.tap
@@ -75,7 +84,7 @@ fn only_frames_of_zenoh_connections_pass_on_any_port() -> Result<()> {
         for part in random(3, 300_000).chunks(7000) {
             pass(&mut other, true, part)?;
         }
-        tapped.read(expected + 1, None)?;
+        tapped.read_within(Duration::from_secs(5), expected + 1, None)?;
         assert_eq!(tapped.frames(), before, "{address}");
     }
     Ok(())

@@ -1,6 +1,21 @@
 use super::super::host_state::tests::host;
 use super::*;
 
+#[test]
+fn a_token_that_the_network_can_read_is_a_warning_with_its_remedy() {
+    let of = |url: &str| {
+        let yaml = format!("fleet: {{engine: '{url}', token_file: /token}}\n");
+        readable_tokens(&Config::parse(yaml.as_bytes()).unwrap())
+    };
+    let found = of("http://prometheus.example:9090");
+    let [finding] = &found[..] else {
+        panic!("{found:?}");
+    };
+    assert_eq!(finding.severity, Severity::Warning);
+    assert!(finding.sentence.contains("fleet.token_file"), "{finding:?}");
+    assert!(of("http://127.0.0.1:9090").is_empty());
+}
+
 fn answers(health: &str, watches: &str) -> Answers {
     Answers {
         health: serde_json::from_str(health).unwrap(),

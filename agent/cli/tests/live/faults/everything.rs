@@ -24,6 +24,7 @@ use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
 use ros2probe_testing::harness::soak::{dropped, long, outcome};
 use ros2probe_testing::harness::usage::Usage;
+use ros2probe_testing::harness::wait_within;
 
 /// Variable with another length of the attack, in seconds.
 const SECONDS: &str = "ROS2PROBE_ATTACK_SECONDS";
@@ -32,6 +33,8 @@ const TOKEN: &str = "0123456789abcdef0123456789abcdef";
 /// default. An unoptimized agent takes several times the CPU of the shipped one.
 const LONGEST: [Duration; 2] = [Duration::from_secs(10), Duration::from_secs(60)];
 const SENT: Duration = Duration::from_secs(60);
+/// Minimum number of datagrams, and of declarations, of a storm.
+const STORM: u64 = 5_000;
 const RECORDINGS: [(&str, &str); 4] = [
     ("real", r#", "topics": {"topics": ["/real", "/cloud"]}"#),
     ("all", ""),
@@ -90,6 +93,7 @@ fn everything(place: &str, capture: impl Fn(&Link) -> String) -> Result<()> {
         endpoints,
         zenoh_aliases,
     } = observe(span, &group, &doors, &mut real)?;
+    wait_for_storms(&storms, &zenoh)?;
     let took = began.elapsed();
     let cpu = Usage::of(scene.pid())?.since(&before).cpu;
     let waited = group.throttled()?.saturating_sub(throttled);
@@ -108,8 +112,8 @@ fn everything(place: &str, capture: impl Fn(&Link) -> String) -> Result<()> {
         peak < allowance.memory / 3 * 2,
         "{peak} bytes with what sockets take"
     );
-    ensure!(sent > 5_000, "{sent} datagrams are no storm");
-    ensure!(declared > 5_000, "{declared} declarations are no storm");
+    ensure!(sent > STORM, "{sent} datagrams are no storm");
+    ensure!(declared > STORM, "{declared} declarations are no storm");
     refusals_have_names(&page)?;
     let counted = real.check(&page)?;
     let mut recorded = 0;
@@ -138,6 +142,14 @@ fn everything(place: &str, capture: impl Fn(&Link) -> String) -> Result<()> {
             answered.join(", "),
         ),
     )
+}
+
+/// Waits until enough is sent and declared. Senders of a busy machine need longer.
+fn wait_for_storms(storms: &[Storm], zenoh: &ZenohStorm) -> Result<()> {
+    wait_within(SENT, "the storms are storms", || {
+        let sent: u64 = storms.iter().map(Storm::sent).sum();
+        Ok(sent > STORM && zenoh.declared() > STORM)
+    })
 }
 
 /// Makes the state directory and the token of a configuration with every kind of client, and

@@ -3,7 +3,7 @@
 use std::io::{self, Write as _};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
@@ -20,7 +20,8 @@ const KEY: usize = 2000;
 /// Sends declarations until [`ZenohStorm::end`].
 pub(super) struct ZenohStorm {
     stop: Arc<AtomicBool>,
-    thread: JoinHandle<Result<u64>>,
+    declared: Arc<AtomicU64>,
+    thread: JoinHandle<Result<()>>,
 }
 
 impl ZenohStorm {
@@ -41,32 +42,43 @@ impl ZenohStorm {
         let mut connections = connected???;
         let stop = Arc::new(AtomicBool::new(false));
         let stopped = Arc::clone(&stop);
-        let thread = std::thread::spawn(move || -> Result<u64> {
+        let declared = Arc::new(AtomicU64::new(0));
+        let counter = Arc::clone(&declared);
+        let thread = std::thread::spawn(move || -> Result<()> {
             for (stream, number) in connections.iter_mut().zip(0..) {
                 stream.write_all(&batch(&init(session(number), Role::Peer, None)))?;
                 stream.write_all(&batch(&open(10)))?;
             }
-            let mut declared = 0;
             for round in 0.. {
                 for (stream, number) in connections.iter_mut().zip(0..) {
                     if stopped.load(Ordering::Relaxed) {
-                        return Ok(declared);
+                        return Ok(());
                     }
                     stream.write_all(&declarations(number, round))?;
-                    declared += u64::from(IN_A_BATCH);
+                    counter.fetch_add(u64::from(IN_A_BATCH), Ordering::Relaxed);
                     std::thread::sleep(rest);
                 }
             }
-            Ok(declared)
+            Ok(())
         });
-        Ok(ZenohStorm { stop, thread })
+        Ok(ZenohStorm {
+            stop,
+            declared,
+            thread,
+        })
+    }
+
+    /// Returns the number of declarations so far.
+    pub(super) fn declared(&self) -> u64 {
+        self.declared.load(Ordering::Relaxed)
     }
 
     /// Returns the number of declarations.
     pub(super) fn end(self) -> Result<u64> {
         self.stop.store(true, Ordering::Relaxed);
         let result = self.thread.join();
-        result.map_err(|_| anyhow!("the storm of Zenoh panicked"))?
+        result.map_err(|_| anyhow!("the storm of Zenoh panicked"))??;
+        Ok(self.declared.load(Ordering::Relaxed))
     }
 }
 

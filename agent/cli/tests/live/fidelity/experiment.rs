@@ -178,6 +178,7 @@ impl Experiment {
         }
         peers.publisher.wait_sent(PATIENCE)?;
         std::thread::sleep(REASSEMBLY);
+        peers.wait_quiet()?;
         let sent = Truth::of(&peers.publisher, "pub")?;
         let received = peers.subscribers.iter().map(|peer| Truth::of(peer, "sub"));
         let received: Vec<Truth> = received.collect::<Result<_>>()?;

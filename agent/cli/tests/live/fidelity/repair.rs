@@ -18,6 +18,8 @@ const PATIENCE: Duration = Duration::from_secs(60);
 /// Number of first samples, some of which are dropped, in a stream of seven seconds.
 const LOSSY_SAMPLES: u64 = 100;
 const SAMPLES: u64 = 220;
+/// Number of last samples, which the publisher sends when all samples are dropped.
+const TAIL: u64 = 40;
 /// One of this many datagrams with samples is dropped.
 const LOSS_PERIOD: u64 = 5;
 
@@ -56,6 +58,7 @@ impl Repair {
             Ok(received + 2 > publisher.log()?.sequences("pub").len())
         })?;
         let _all = Loss::of_datagrams(&link.robot, &samples, 1, Part::Whole)?;
+        publisher.start_sending()?;
         let (sent, reader) = (
             Truth::of(&publisher, "pub")?,
             Truth::of(&subscriber, "sub")?.guid,
@@ -149,7 +152,8 @@ fn delivered_pair(link: &Link, stack: Stack, witness: &mut Witness) -> Result<(P
         reliable: true,
         depth: 1000,
         rate: 30.0,
-        linger: 60.0,
+        stretch: SAMPLES - TAIL,
+        linger: 120.0,
         ..Stream::small(SAMPLES)
     };
     let host = &link.monitor;

@@ -162,7 +162,7 @@ fn after_a_kill_of_either_peer_counts_recover_and_no_file_stays_open() -> Result
                     continue;
                 }
                 peer.process.signal("KILL")?;
-                peer.process.wait(Duration::from_secs(5))?;
+                peer.process.wait(PATIENCE)?;
                 *peer = host.launch(each, &stream)?;
                 peer.wait_ready()?;
                 if each == Role::Publisher {

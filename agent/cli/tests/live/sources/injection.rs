@@ -21,7 +21,7 @@ use ros2probe_testing::harness::run;
 /// MTU of a cable, so that datagrams are fragmented as on one.
 const MTU: u32 = 1500;
 const LOOPBACK: &str = "lo";
-const PATIENCE: Duration = Duration::from_secs(5);
+const PATIENCE: Duration = Duration::from_secs(60);
 
 /// One datagram of a capture.
 struct Datagram {

@@ -290,21 +290,22 @@ fn bounds_of_queries(agent: &LocalAgent, document: &Value, check: Check<'_>) {
         let path = path
             .replace("{topic}", "chatter")
             .replace("{node}", "talker")
-            .replace("{noun}", "chains");
+            .replace("{noun}", "topics");
         for parameter in parameters
             .iter()
             .filter(|parameter| parameter["in"] == "query")
         {
             let (name, schema) = (parameter["name"].as_str().unwrap(), &parameter["schema"]);
             let ask = |value: &str| {
-                // These parameters need a topic.
-                let topic = match (path.as_str(), name) {
+                // These parameters need a topic, or a moment.
+                let other = match (path.as_str(), name) {
                     ("/samples", "exclude" | "exclude_regex" | "domain_id" | "queue_bytes") => {
                         "topic=/a&"
                     }
+                    ("/history/moment/topics", "domain_id") => "at=1790000000&",
                     _ => "",
                 };
-                status(agent, "GET", &format!("{path}?{topic}{name}={value}"), "")
+                status(agent, "GET", &format!("{path}?{other}{name}={value}"), "")
             };
             let what = format!("{path} {name}");
             if let Some(maximum) = schema["maximum"].as_i64() {

@@ -1,10 +1,12 @@
 //! Watches of clients, together with those of the configuration.
 
 use super::*;
+use crate::recordings::long_capture;
 
 #[test]
 fn a_watch_is_added_shown_replaced_and_removed() {
-    let mut agent = LocalAgent::start(&mut rp(), &["--speed", "0.5"]);
+    let capture = long_capture();
+    let mut agent = LocalAgent::replay(&mut rp(), &capture, &["--speed", "1"]);
     agent.wait_for_log("ready");
     let json = "Content-Type: application/json\r\n";
     let added = ask(&agent, "POST", "/watch/chatter", "", "");

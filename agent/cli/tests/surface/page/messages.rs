@@ -1,13 +1,13 @@
 //! Decoded messages, and downloads of bags.
 
 use super::*;
+use crate::recordings::long_capture;
 
 #[test]
 fn at_most_five_messages_per_second_are_decoded() {
-    let capture = data("cyclonedds/lifecycle-2ns");
-    let mut agent = LocalAgent::replay(&mut rp(), &capture, &["--watch", "/**", "--speed", "0.5"]);
+    let capture = long_capture();
+    let mut agent = LocalAgent::replay(&mut rp(), &capture, &["--watch", "/**", "--speed", "1"]);
     agent.wait_for_log("ready");
-    // The robot of the capture begins to publish this topic some time after the start.
     let deadline = Instant::now() + PATIENCE;
     let topic = loop {
         let topics = get(&agent, "/topics");
@@ -86,9 +86,9 @@ fn at_most_five_messages_per_second_are_decoded() {
 
 #[test]
 fn the_number_of_topics_with_decoded_messages_is_limited() {
-    // The replay is slow enough that no stream ends during the test.
-    let capture = data("cyclonedds/lifecycle-2ns");
-    let mut agent = LocalAgent::replay(&mut rp(), &capture, &["--watch", "/**", "--speed", "0.2"]);
+    // The capture is long enough that no stream ends during the test.
+    let capture = long_capture();
+    let mut agent = LocalAgent::replay(&mut rp(), &capture, &["--watch", "/**", "--speed", "1"]);
     agent.wait_for_log("ready");
     let deadline = Instant::now() + PATIENCE;
     let topic = loop {
@@ -112,7 +112,7 @@ fn the_number_of_topics_with_decoded_messages_is_limited() {
         (503, "too-many-streams".to_owned())
     );
     all.pop();
-    let deadline = Instant::now() + Duration::from_secs(5);
+    let deadline = Instant::now() + PATIENCE;
     while open().is_err() {
         assert!(Instant::now() < deadline, "a closed stream keeps its place");
         std::thread::sleep(Duration::from_millis(50));
@@ -133,7 +133,7 @@ fn all_files_of_a_bag_can_be_downloaded() {
     )
     .unwrap();
     std::fs::create_dir(&bags).unwrap();
-    let capture = data("cyclonedds/points-besteffort-lossy-2ns");
+    let capture = long_capture();
     let mut agent = LocalAgent::replay(
         &mut rp(),
         &capture,
@@ -149,7 +149,11 @@ fn all_files_of_a_bag_can_be_downloaded() {
     agent.wait_for_log("ready");
     let (status, begun) = call_api(agent.api, "POST", "/recordings", r#"{"name": "one"}"#);
     assert_eq!(status, 201, "{begun}");
-    std::thread::sleep(Duration::from_millis(500));
+    let deadline = Instant::now() + PATIENCE;
+    while get(&agent, "/recordings/one")["report"]["messages"].as_u64() < Some(1) {
+        assert!(Instant::now() < deadline, "nothing was recorded");
+        std::thread::sleep(Duration::from_millis(50));
+    }
     assert_eq!(call_api(agent.api, "DELETE", "/recordings/one", "").0, 200);
     let files = get(&agent, "/recordings/one/files");
     let files = rows(&files["files"]);

@@ -51,7 +51,7 @@ fn a_stream_begins_with_the_whole_state_and_continues_with_changes() {
         assert_eq!(batch[0].1["replay"][1], 1);
     }
     assert!(
-        (1.0..6.0).contains(&began.elapsed().as_secs_f64()),
+        (1.0..30.0).contains(&began.elapsed().as_secs_f64()),
         "{began:?}"
     );
     // A watch changes the structure, but not the figures.
@@ -168,7 +168,7 @@ fn streams_beyond_the_cap_are_refused_until_one_is_closed() {
         (503, "too-many-streams".to_owned())
     );
     all.truncate(11);
-    let deadline = Instant::now() + Duration::from_secs(5);
+    let deadline = Instant::now() + PATIENCE;
     while open().is_err() {
         assert!(Instant::now() < deadline, "a closed stream keeps its place");
         std::thread::sleep(Duration::from_millis(50));
@@ -186,12 +186,17 @@ fn a_client_that_reads_late_gets_all_changes() {
     // batch.
     let mut state = std::collections::BTreeMap::new();
     let mut graph = Value::Null;
-    let until = Instant::now() + Duration::from_secs(3);
-    while Instant::now() < until {
+    let deadline = Instant::now() + PATIENCE;
+    // Two batches without a change after the end of the capture are enough.
+    let mut unchanged = 0;
+    while unchanged < 2 {
+        assert!(Instant::now() < deadline, "the figures still change");
         for (name, value) in slow.batch() {
             match name.as_str() {
                 "graph" => graph = value,
                 "values" => {
+                    let is_still = value["replay"][1] == 1 && rows(&value["topics"]).is_empty();
+                    unchanged = if is_still { unchanged + 1 } else { 0 };
                     for row in rows(&value["topics"]) {
                         state.insert(row[0].as_u64().unwrap(), row.clone());
                     }

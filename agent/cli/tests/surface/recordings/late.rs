@@ -35,7 +35,7 @@ fn a_recording_warns_early_and_repeatedly_of_writers_without_a_topic() {
     let mut recording = Recording::start(agent.api, &directory.path().join("bag"), &[]);
     recording.wait_for("Recording...");
     let first = recording.wait_for(&format!("not recorded: {MISSED}"));
-    assert!(first < Duration::from_secs(3), "{first:?}");
+    assert!(first < Duration::from_secs(30), "{first:?}");
     let line = recording.printed.last().unwrap();
     assert!(line.contains("[WARN]") && line.ends_with(REMEDY), "{line}");
     let again = recording.wait_for("not recorded: 1 writer is active");

@@ -473,3 +473,47 @@ fn the_history_on_disk_needs_two_minutes_in_memory() {
     assert_eq!(seconds("page: {history_s: 0}"), 0);
     assert_eq!(seconds("page: {history_s: 900}"), 900);
 }
+
+#[test]
+fn the_engine_of_a_fleet_and_its_robots_are_checked() {
+    for (yaml, expected) in [
+        ("engine: 'prometheus:9090'", "the URL of an engine"),
+        ("engine: 'http://a/?b'", "the URL of an engine"),
+        ("token_file: token", "/etc/ros2probe/engine.token"),
+        ("job: ''", "the value of a label"),
+        ("link: 'http://robot/'", "a URL with `{robot}`"),
+        ("link: 'javascript:{robot}'", "a URL with `{robot}`"),
+        ("reach_s: 0", "reach_s"),
+        ("since_h: 721", "since_h"),
+        ("store: {url: bags}", "a destination"),
+        (
+            "store: {url: 's3://b', endpoint: minio}",
+            "the URL of a store",
+        ),
+        (
+            "store: {url: 's3://b', ca_file: pem}",
+            "must be an absolute path",
+        ),
+        ("store: {url: 's3://b', windows: []}", "windows"),
+    ] {
+        let text = report(&format!("fleet: {{{yaml}}}\n"));
+        assert!(text.contains(expected), "{yaml}: {text}");
+    }
+    let yaml = "fleet: {engine: 'http://a:9090/prometheus', link: 'http://{robot}/', reach_s: 5}\n";
+    let fleet = Config::parse(yaml.as_bytes()).unwrap().fleet;
+    assert_eq!(fleet.engine.as_deref(), Some("http://a:9090/prometheus"));
+    assert_eq!(fleet.question.job, "ros2probe");
+    assert_eq!((fleet.question.hours, fleet.question.reach), (24, 5));
+    assert_eq!(fleet.link.unwrap().of("r"), "http://r/");
+    assert_eq!(fleet.store, None);
+    let yaml = "fleet: {store: {url: 's3://bags/fleet', region: eu, ca_file: /a.pem}}\n";
+    let fleet = Config::parse(yaml.as_bytes()).unwrap().fleet;
+    let store = fleet.store.unwrap();
+    assert_eq!(store.url, "s3://bags/fleet");
+    assert_eq!(store.region.as_deref(), Some("eu"));
+    assert_eq!(
+        store.ca_file.as_deref(),
+        Some(std::path::Path::new("/a.pem"))
+    );
+    assert_eq!(Config::default().fleet.engine, None);
+}

@@ -151,13 +151,12 @@ pub(super) fn diagnosis(finding: &diagnosis::Diagnosis) -> Finding<'_> {
         diagnosis::Diagnosis::LossyLink {
             link,
             retransmitted_permille,
+            unsent,
         } => Diagnosis::LossyLink {
             source: link.source,
             destination: link.destination,
             retransmitted_ratio: thousandths(*retransmitted_permille),
-        },
-        diagnosis::Diagnosis::SharedMachineId { participants, .. } => Diagnosis::SharedMachineId {
-            participants: printed(participants),
+            unsent_bytes: *unsent,
         },
         diagnosis::Diagnosis::LogErrors { errors, text, .. } => Diagnosis::LogErrors {
             errors: *errors,

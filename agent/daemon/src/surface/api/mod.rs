@@ -15,6 +15,7 @@ mod downloads;
 mod endpoint;
 mod events;
 mod finding;
+mod fleet;
 mod graph;
 mod health;
 mod history;
@@ -73,6 +74,7 @@ use super::ros2_daemon::Ros2DaemonFigures;
 use crate::config::{Access, Limit};
 use crate::disk_history::DiskHistory;
 use crate::events::EventLog;
+use crate::fleet::Reader;
 use crate::limit_facts::LimitFigures;
 use crate::recording::RecordingFigures;
 use crate::recording::{Recordings, Snapshots};
@@ -132,6 +134,8 @@ pub struct Context {
     pub page: Arc<Page>,
     /// Examines this host.
     pub doctor: Doctor,
+    /// The robots of a fleet; `None` without an engine.
+    pub fleet: Option<Arc<Reader>>,
     /// Reloads the configuration.
     pub reloader: Reloader,
     /// Ends the streams when the agent stops.
@@ -210,6 +214,7 @@ fn nouns(context: Option<&Context>) -> OpenApiRouter<Context> {
         .merge(needs(Access::All, Access::All, diagnostics::routes()))
         .merge(needs(Access::All, Access::All, ros_parameters::routes()))
         .merge(transforms::routes())
+        .merge(turns(fleet::routes()))
         .merge(health::routes())
         .merge(needs(Access::All, Access::All, reload::routes()))
         .merge(needs(Access::Read, Access::All, replay::routes()))

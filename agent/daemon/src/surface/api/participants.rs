@@ -61,6 +61,7 @@ pub(super) fn answer(snapshot: &Snapshot, domain: Domain) -> ParticipantList<'_>
             .map(|each| unknown_writer(each, clock))
             .collect(),
         links: snapshot.links.iter().map(link).collect(),
+        tls_connections: snapshot.tls_connections,
     }
 }
 
@@ -74,6 +75,7 @@ fn link(facts: &LinkFacts) -> Link<'static> {
         sent_segments: facts.sent,
         retransmitted_segments: facts.retransmitted,
         unacknowledged_bytes: facts.unacknowledged,
+        unsent_bytes: facts.unsent,
     }
 }
 

@@ -90,7 +90,14 @@ impl<'a> ReasonInputs<'a> {
                         wire sees traffic that passes this host";
                     say(ReasonCode::OutsideView, detail.to_owned());
                 } else {
-                    say(ReasonCode::Quiet, self.quiet(measured));
+                    let by_tcp = topic.transports.iter();
+                    let is_tcp = by_tcp.clone().all(|it| it.transport == Transport::Tcp);
+                    let is_unseen = is_tcp && measured.last_message.is_none();
+                    let tls = match is_unseen && by_tcp.len() > 0 {
+                        true => "; a TCP connection with TLS cannot be read",
+                        false => "",
+                    };
+                    say(ReasonCode::Quiet, self.quiet(measured) + tls);
                 }
             }
             Some(_) => {}

@@ -16,6 +16,7 @@ use super::finding::diagnosis;
 use super::history;
 use super::index::{Index, WatchedTopic};
 use super::inside;
+use super::live::is_shown;
 use super::measured::{breakdown, buckets, delivered, topic_measurement};
 use super::messages;
 use super::nearest::hint;
@@ -86,7 +87,9 @@ pub(super) fn details_without_figures<'a>(
     in_force: &'a ActiveWatches,
 ) -> TopicDetailsList<'a> {
     let answers = TopicAnswers::new(state, in_force);
+    // Each node has a dozen topics of services, which no view of the past shows.
     let topics = answers.snapshot.topics.iter();
+    let topics = topics.filter(|topic| is_shown(topic));
     TopicDetailsList {
         timestamp_seconds: answers.snapshot.time().seconds(),
         topics: topics

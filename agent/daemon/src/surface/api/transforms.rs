@@ -14,7 +14,9 @@ use super::Context;
 use super::parameters::Parameters;
 use super::problem::{Problem, ProblemBody};
 use super::scope::Domain;
-use ros2probe_api::transforms::{Broadcaster, TransformEdge, TransformTree, Transforms};
+use ros2probe_api::transforms::{
+    Broadcaster, TransformEdge, TransformJumps, TransformTree, Transforms,
+};
 use ros2probe_model::facts::wall_clock::WallClock;
 use ros2probe_model::report::snapshot::{EdgeFacts, Snapshot, TreeFacts};
 
@@ -92,6 +94,12 @@ fn edge_view(edge: &EdgeFacts, clock: WallClock) -> TransformEdge<'_> {
         broadcasters: broadcasters.collect(),
         messages: edge.count,
         rate_hz: edge.rate,
+        longest_interval_seconds: edge.longest_interval.map(|interval| interval.as_secs_f64()),
+        jumps: TransformJumps {
+            translation: edge.jumps.translation,
+            rotation: edge.jumps.rotation,
+            time: edge.jumps.time,
+        },
         timestamp_seconds: clock.wall_time(edge.at).seconds(),
         stamp_sec: edge.stamp.0,
         stamp_nanosec: edge.stamp.1,

@@ -181,7 +181,7 @@ fn nanoseconds(duration: Duration) -> u64 {
 mod tests {
     use super::*;
     use ros2probe_model::facts::calls::late::{
-        Activity, Blocked, Cause, LateBound, LateCall, MessageDelivery,
+        Activity, Blocked, Cause, LateBound, LateCall, MessageDelivery, Repairs,
     };
     use ros2probe_model::facts::calls::other_thread::Priority;
     use ros2probe_model::facts::calls::report::ThreadStates;
@@ -224,6 +224,7 @@ mod tests {
                 receiver: None,
             }),
             handoff: None,
+            repairs: Repairs::default(),
             cpu_limits: Arc::new([]),
             stop: None,
             released_by: None,

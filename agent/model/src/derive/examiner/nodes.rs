@@ -10,9 +10,6 @@ use crate::facts::diagnosis::Diagnosis;
 use crate::facts::names::NodeName;
 use crate::graph::discovery::{Discovery, Node, Participant};
 
-/// Maximum number of hosts that are distinguished.
-const MAX_HOSTS: usize = 16;
-
 /// A node with its participant.
 #[derive(Clone, Copy, Debug)]
 struct HostedNode<'a> {
@@ -52,74 +49,6 @@ pub(super) fn examine(discovery: &Discovery, findings: &mut Findings) {
             });
         }
         several_domains(name, nodes, discovery, findings);
-    }
-}
-
-/// Adds participants of Fast DDS that consider each other to be on one host, although nothing else
-/// shows it: cloned machines, or containers with the host's machine id. They share a host if they
-/// have a common address, an equal host in their GUIDs, or if both send from this host.
-pub(super) fn examine_machines(discovery: &Discovery, findings: &mut Findings) {
-    let mut machines: BTreeMap<(DomainId, &str), Vec<Host>> = BTreeMap::new();
-    for (prefix, participant) in discovery.participants() {
-        let proxy = &participant.proxy;
-        // A restored participant may be an earlier run, with an earlier address.
-        let (Some(id), true, None) = (&proxy.machine_id, proxy.shared_memory, participant.restored)
-        else {
-            continue;
-        };
-        let Some(addresses) = addresses(participant) else {
-            continue;
-        };
-        let hosts = machines.entry((participant.domain_id, id)).or_default();
-        let host = Host {
-            first: Guid::new(*prefix, EntityId::PARTICIPANT),
-            in_guid: prefix.0.first_chunk().copied().into_iter().collect(),
-            addresses,
-            is_here: participant.local,
-        };
-        let (same, mut others): (Vec<_>, Vec<_>) =
-            hosts.drain(..).partition(|other| other.is(&host));
-        others.push(same.into_iter().fold(host, Host::and));
-        others.truncate(MAX_HOSTS);
-        *hosts = others;
-    }
-    for ((domain_id, _), hosts) in machines {
-        if hosts.len() > 1 {
-            let mut participants: Vec<_> = hosts.iter().map(|host| host.first).collect();
-            participants.sort_unstable();
-            findings.add(Diagnosis::SharedMachineId {
-                domain_id,
-                participants,
-            });
-        }
-    }
-}
-
-/// Participants that share a host.
-#[derive(Debug)]
-struct Host {
-    /// The lowest GUID.
-    first: Guid,
-    /// First bytes of the GUIDs, in which Fast DDS stores the host.
-    in_guid: BTreeSet<[u8; 4]>,
-    addresses: BTreeSet<IpAddr>,
-    /// Whether one of them sends from this host.
-    is_here: bool,
-}
-
-impl Host {
-    fn is(&self, other: &Self) -> bool {
-        self.is_here && other.is_here
-            || !self.in_guid.is_disjoint(&other.in_guid)
-            || !self.addresses.is_disjoint(&other.addresses)
-    }
-
-    fn and(mut self, other: Self) -> Self {
-        self.first = self.first.min(other.first);
-        self.in_guid.extend(other.in_guid);
-        self.addresses.extend(other.addresses);
-        self.is_here |= other.is_here;
-        self
     }
 }
 

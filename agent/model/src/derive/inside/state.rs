@@ -19,13 +19,14 @@ use crate::facts::bounded::{Bounded, Counted, Sum};
 use crate::facts::calls::facts::{
     InsideFacts, LifecycleState, NewLateCalls, ObservedProcess, TopicInside,
 };
-use crate::facts::calls::late::LateCall;
+use crate::facts::calls::late::{LateCall, Repairs};
 use crate::facts::calls::report::{ProcessReport, Report, ThreadStates, Transition, Trigger};
 use crate::facts::diagnosis::Diagnosis;
 use crate::facts::measurement::Measurement;
 use crate::facts::model_time::ModelTime;
 use crate::facts::names::{NodeName, TopicName};
 use crate::facts::naming::Naming;
+use crate::facts::repairs::Awaited;
 use crate::facts::tables::{InsideHandles, LifecycleStates, ObservedProcesses, ReportedNodes};
 use crate::facts::wall_clock::WallClock;
 use crate::graph::discovery::Discovery;
@@ -57,6 +58,10 @@ pub struct Inside {
     /// Number of changes of the findings.
     pub(super) revision: u64,
 }
+
+/// Returns the retransmissions for which a call waited, by the participants of its process, its topic
+/// and its message.
+pub type RepairsOf<'a> = &'a dyn Fn(&BTreeSet<GuidPrefix>, (DomainId, &Naming), Awaited) -> Repairs;
 
 /// An observed process.
 #[derive(Debug)]
@@ -99,7 +104,8 @@ impl Inside {
         facts
     }
 
-    /// Processes a report, whose times are wall times. Returns its transitions of managed nodes.
+    /// Processes a report, whose times are wall times. `repairs` returns the retransmissions for which
+    /// a call waited. Returns its transitions of managed nodes.
     /// Those of the first report happened before it, while the nodes' own messages showed them, and
     /// are not returned.
     pub fn report(
@@ -108,6 +114,7 @@ impl Inside {
         clock: WallClock,
         discovery: &Discovery,
         receivers: &Receivers,
+        repairs: RepairsOf<'_>,
     ) -> Vec<LifecycleState> {
         let Report {
             at,
@@ -136,7 +143,7 @@ impl Inside {
         self.attribute(discovery, receivers);
         self.add_to_topics(&added, &ended, at);
         for call in late {
-            self.note_late(call, clock);
+            self.note_late(call, clock, repairs);
         }
         let transitions = transitions.into_iter();
         let mut transitions: Vec<_> = transitions.map(|each| self.transit(each, clock)).collect();
@@ -504,7 +511,7 @@ impl Inside {
     }
 
     /// Adds a late call to those of its callback.
-    fn note_late(&mut self, mut call: LateCall, clock: WallClock) {
+    fn note_late(&mut self, mut call: LateCall, clock: WallClock, repairs: RepairsOf<'_>) {
         let process = self.processes.get(&call.process);
         let key = (Kind::Callback, call.handle);
         let tracked = process.and_then(|process| process.handles.get(&key));
@@ -514,6 +521,18 @@ impl Inside {
             domain_id = tracked.domain_id;
             usual = tracked.figures.states();
             call.node = call.node.or_else(|| tracked.node.clone());
+        }
+        if let (Some(process), Trigger::Subscription(topic)) = (process, &call.trigger)
+            && let Some(topic) = self.topics.get(domain_id, topic)
+            && let (Some(source), Some(wait)) = (call.source, call.wait)
+        {
+            let started = clock.model_time(call.started);
+            let awaited = Awaited {
+                source,
+                started,
+                wait,
+            };
+            call.repairs = repairs(&process.participants, (domain_id, &topic.naming), awaited);
         }
         self.late.add(call, domain_id, usual, clock);
     }

@@ -40,6 +40,8 @@ pub struct LateCall {
     pub delivery: Option<MessageDelivery>,
     /// How the executor's thread was woken, if a thread of the middleware did that.
     pub handoff: Option<Handoff>,
+    /// Retransmissions for which the call waited. The model adds them.
+    pub repairs: Repairs,
     /// Limits on the speed of CPUs, at most a second after the call.
     pub cpu_limits: Arc<[CpuLimit]>,
     /// The last time before the call in which the thread was stopped.
@@ -173,6 +175,16 @@ pub struct MessageDelivery {
     pub receiver: Option<WaitingStates>,
 }
 
+/// Retransmissions for which a call waited: times from the arrival to the start of the call.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Repairs {
+    /// The message itself was lost at first.
+    pub of_message: Option<Duration>,
+    /// An earlier message of the same publisher was lost at first. The middleware kept the later ones
+    /// until it arrived.
+    pub of_earlier: Option<Duration>,
+}
+
 /// How a thread of the middleware passed a message to the executor's thread: times before the start
 /// of the call.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -248,7 +260,8 @@ pub enum Stage {
     Network,
     /// In the receive buffer of that socket.
     Socket,
-    /// Until a thread of the middleware passed it to the executor. Known without a socket.
+    /// Until a thread of the middleware passed it to the executor. Known without a socket, and of a
+    /// message that waited for an earlier one.
     Receive,
     /// Until the callback started, since it was ready. If the way of the message is not known, this
     /// includes the other stages.
@@ -290,6 +303,8 @@ pub enum Cause {
     Send,
     /// The message was long on its way.
     Transit,
+    /// The message, or an earlier one of its publisher, was lost and sent again.
+    Repaired,
     /// No thread received the message from its socket.
     Queue,
     /// The middleware had received the message, and the executor's thread waited for it.
@@ -325,7 +340,7 @@ impl Stage {
 
 impl Cause {
     /// Every cause.
-    pub const ALL: [Self; 18] = [
+    pub const ALL: [Self; 19] = [
         Self::Cpu,
         Self::Stolen,
         Self::Throttled,
@@ -341,6 +356,7 @@ impl Cause {
         Self::Arrival,
         Self::Send,
         Self::Transit,
+        Self::Repaired,
         Self::Queue,
         Self::Middleware,
         Self::Unexplained,
@@ -365,6 +381,7 @@ impl Cause {
             Self::Arrival => "arrival",
             Self::Send => "send",
             Self::Transit => "transit",
+            Self::Repaired => "repaired",
             Self::Queue => "queue",
             Self::Middleware => "middleware",
             Self::Unexplained => "unexplained",
@@ -395,6 +412,7 @@ impl Cause {
                 None => "its publisher took long to send it".to_owned(),
             },
             Self::Transit => "the message was long on its way to the socket".to_owned(),
+            Self::Repaired => "the message or one before it was lost and sent again".to_owned(),
             Self::Queue => "the message waited in the socket's receive buffer".to_owned(),
             Self::Middleware => "the middleware passed the message on late".to_owned(),
             Self::Unexplained => "the cause is unknown".to_owned(),
@@ -423,6 +441,9 @@ impl Cause {
             Self::Arrival => "look at the topic's network path and at its publisher",
             Self::Send => "look at the publisher's process: it is busy, or its CPU is",
             Self::Transit => "look at the link between the hosts, and at losses on it",
+            Self::Repaired => {
+                "look where messages of the topic get lost: on the link, or at a full buffer"
+            }
             Self::Queue => "find what keeps the process from running: a busy CPU, a quota, SIGSTOP",
             Self::Middleware => {
                 "send smaller messages, or give the middleware's threads a free CPU"
@@ -462,6 +483,7 @@ impl Cause {
             | Self::Arrival
             | Self::Send
             | Self::Transit
+            | Self::Repaired
             | Self::Queue
             | Self::Middleware
             | Self::Unexplained => None,

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use super::late::{Activity, Cause, Handoff, LateCall, Part, PreviousCall, Stage, Stop};
+use super::late::{Activity, Cause, Handoff, LateCall, Part, PreviousCall, Repairs, Stage, Stop};
 use super::other_thread::OtherThread;
 use super::report::ThreadStates;
 
@@ -33,11 +33,18 @@ impl LateCall {
             return Vec::new();
         };
         let Some(delivery) = &self.delivery else {
-            return match &self.handoff {
+            // The rest of the way is not known, so the arrival of a message behind a lost one is not.
+            let since_arrival = wait.min(self.repairs.of_message.unwrap_or(wait));
+            let network = Remainder::new(Stage::Network, wait - since_arrival);
+            let mut parts = network.finish(Cause::Repaired);
+            parts.extend(match &self.handoff {
                 // The thread ran already when the message was published.
-                Some(handoff) if handoff.woken_before <= wait => self.handoff_parts(handoff, wait),
-                _ => self.executor_parts(wait, Cause::Arrival),
-            };
+                Some(handoff) if handoff.woken_before <= since_arrival => {
+                    self.handoff_parts(handoff, since_arrival)
+                }
+                _ => self.executor_parts(since_arrival, Cause::Arrival),
+            });
+            return parts;
         };
         let in_process = wait.min(delivery.received_before);
         let since_arrival = wait.min(delivery.arrived_before);
@@ -47,7 +54,10 @@ impl LateCall {
         };
         let mut parts = Remainder::new(Stage::Publish, wait - since_sent).finish(Cause::Send);
         let network = Remainder::new(Stage::Network, since_sent - since_arrival);
-        parts.extend(network.finish(Cause::Transit));
+        parts.extend(network.finish(match self.repairs.of_message {
+            Some(_) => Cause::Repaired,
+            None => Cause::Transit,
+        }));
         let mut socket = Remainder::new(Stage::Socket, since_arrival - in_process);
         if let Some(receiver) = &delivery.receiver {
             socket.take(Cause::Throttled, receiver.throttled);
@@ -55,7 +65,16 @@ impl LateCall {
         }
         socket.take(Cause::Stopped, self.stopped(in_process, since_arrival));
         parts.extend(socket.finish(Cause::Queue));
-        parts.extend(self.executor_parts(in_process, Cause::Middleware));
+        // The middleware kept the message until an earlier one had arrived, or fragments of its own.
+        let Repairs {
+            of_message,
+            of_earlier,
+        } = self.repairs;
+        let arrivals = [of_message, of_earlier].into_iter().flatten();
+        let in_order = arrivals.fold(in_process, Duration::min);
+        let receive = Remainder::new(Stage::Receive, in_process - in_order);
+        parts.extend(receive.finish(Cause::Repaired));
+        parts.extend(self.executor_parts(in_order, Cause::Middleware));
         parts
     }
 

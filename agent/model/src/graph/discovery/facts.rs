@@ -82,13 +82,16 @@ pub struct ParticipantProxy {
     pub machine_id: Option<Arc<str>>,
 }
 
-/// Unicast UDP addresses of a participant.
+/// Unicast addresses of a participant.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Addresses {
-    /// Addresses of its discovery endpoints.
+    /// UDP addresses of its discovery endpoints.
     pub metatraffic: Box<[SocketAddr]>,
-    /// Addresses of its other endpoints.
+    /// UDP addresses of its other endpoints.
     pub default: Box<[SocketAddr]>,
+    /// Addresses at which it accepts TCP connections.
+    #[serde(default)]
+    pub tcp: Box<[SocketAddr]>,
 }
 
 impl Addresses {
@@ -96,6 +99,17 @@ impl Addresses {
     #[must_use]
     pub fn reachable(&self) -> Option<IpAddr> {
         self.hosts().next()
+    }
+
+    /// Returns whether the participant accepts TCP connections at this address. Fast DDS uses the
+    /// loopback address for participants of its host, which announce other ones.
+    #[must_use]
+    pub fn accepts_tcp(&self, at: SocketAddr) -> bool {
+        let is_own = |address: &SocketAddr| {
+            let is_same = address.ip() == at.ip() || at.ip().is_loopback();
+            address.port() == at.port() && is_same
+        };
+        self.tcp.iter().any(is_own)
     }
 
     /// Returns whether both have addresses that other hosts can reach, and none in common.
@@ -271,9 +285,13 @@ impl Addresses {
             let addresses = locators.iter().filter_map(Locator::udp);
             addresses.take(MAX_ADDRESSES).collect()
         };
+        let unicast =
+            (announcement.metatraffic_unicast.iter()).chain(&announcement.default_unicast);
+        let tcp: BTreeSet<_> = unicast.flat_map(Locator::tcp).collect();
         Self {
             metatraffic: udp(&announcement.metatraffic_unicast),
             default: udp(&announcement.default_unicast),
+            tcp: tcp.into_iter().take(MAX_ADDRESSES).collect(),
         }
     }
 }

@@ -2,14 +2,16 @@
 
 use std::collections::BTreeSet;
 
-use ros2probe_wire::qos::HistoryKind;
+use ros2probe_wire::qos::{HistoryKind, Reliability};
 use ros2probe_wire::{DomainId, Guid, GuidPrefix};
 
 use super::Observer;
 use crate::derive::inside::reader_queue::{Arrivals, ArrivalsOf};
+use crate::facts::calls::late::Repairs;
 use crate::facts::diagnosis::{Offer, Verdict, verdict};
 use crate::facts::model_time::ModelTime;
 use crate::facts::naming::Naming;
+use crate::facts::repairs::{Awaited, RepairLog};
 use crate::facts::route::Direction;
 use crate::facts::route::Receiver;
 use crate::graph::discovery::Discovery;
@@ -85,6 +87,52 @@ fn arrivals(
         }
     }
     Some(found)
+}
+
+/// Returns the retransmissions for which a call of one of these participants waited.
+pub(super) fn repairs(
+    (graph, profiler, log): (&Graph, &Profiler, &RepairLog),
+    participants: &BTreeSet<GuidPrefix>,
+    (domain_id, naming): (DomainId, &Naming),
+    awaited: Awaited,
+) -> Repairs {
+    let topics = &graph.topics;
+    let topic = topics.find(domain_id, naming).and_then(|id| topics.get(id));
+    let Some(topic) = topic else {
+        return Repairs::default();
+    };
+    let concerns = |writer: Guid, receiver: GuidPrefix| {
+        participants.contains(&receiver) && topic.writers.contains(&writer)
+    };
+    let found = log.of(awaited, concerns);
+    if found.of_earlier.is_none() {
+        return found;
+    }
+    // The writer of a message that was not lost is not known, and a best-effort reader does not wait.
+    let measured = topic.writers.iter().filter_map(|id| profiler.get(*id));
+    let subscribers = measured.filter_map(|measured| measured.subscribers.as_ref());
+    let deliveries = subscribers.flat_map(|subscribers| subscribers.deliveries());
+    let received = deliveries.filter(|(delivery, _)| match delivery.receiver() {
+        Receiver::Participant(prefix) => {
+            delivery.direction() == Direction::Received && participants.contains(&prefix)
+        }
+        Receiver::Route(_) => false,
+    });
+    let endpoints = graph.discovery.endpoints();
+    let mut readers = participants
+        .iter()
+        .flat_map(|prefix| topic.readers_of(*prefix));
+    let are_reliable = readers.all(|reader| {
+        let reader = endpoints.get(&reader);
+        reader.is_some_and(|reader| reader.qos.reliability == Reliability::RELIABLE)
+    });
+    match are_reliable && received.count() == 1 {
+        true => found,
+        false => Repairs {
+            of_earlier: None,
+            ..found
+        },
+    }
 }
 
 /// Returns whether both endpoints have the same type and compatible quality of service; `None` if

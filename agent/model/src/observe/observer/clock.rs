@@ -156,6 +156,7 @@ impl Observer {
         }
         if now.nanoseconds().is_multiple_of(SECOND) {
             self.measure.links.end_second(now);
+            self.measure.tls.end_second(now, &self.graph.discovery);
             self.measure.payloads.expire(now);
             for writer in self.measure.latched.advance(now) {
                 self.apply_lists_to_latched(writer, now);

@@ -4,6 +4,7 @@
 use ros2probe_wire::lifecycle::LifecycleState;
 
 use super::Observer;
+use super::arrivals::repairs;
 use crate::derive::inside::source::Seen;
 use crate::derive::robot::lifecycle::ManagedNode;
 use crate::facts::calls::report::Report;
@@ -17,11 +18,19 @@ impl Observer {
     pub(super) fn report_inside(&mut self, report: Report) {
         let clock = self.graph.wall_clock;
         let at = clock.model_time(report.at);
-        let (discovery, receivers) = (&self.graph.discovery, &self.graph.receivers);
-        let transitions = self
-            .derive
-            .inside
-            .report(report, clock, discovery, receivers);
+        let (graph, profiler) = (&self.graph, &self.measure.profiler);
+        let log = &self.journal.repairs;
+        let (discovery, receivers) = (&graph.discovery, &graph.receivers);
+        let inside = &mut self.derive.inside;
+        let transitions = inside.report(
+            report,
+            clock,
+            discovery,
+            receivers,
+            &|participants, topic, awaited| {
+                repairs((graph, profiler, log), participants, topic, awaited)
+            },
+        );
         for state in transitions {
             let events = &mut self.journal.events;
             events.push(

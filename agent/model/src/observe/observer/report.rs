@@ -48,6 +48,7 @@ pub(super) fn snapshot(observer: &Observer, wall_time: Timestamp) -> Snapshot {
         zenoh: observer.zenoh.is_used().then(|| observer.zenoh.facts()),
         chains: observer.derive.chains.facts(wall_time),
         links: observer.measure.links.facts(),
+        tls_connections: observer.measure.tls.counted(),
         diagnostics: (observer.derive.robot.diagnostics())
             .facts(observer.settings.robot.has(Part::Diagnostics)),
         transforms: (observer.derive.robot.transforms()).facts(
@@ -477,6 +478,7 @@ fn tables(observer: &Observer) -> Vec<TableFacts> {
     tables.extend(observer.measure.latched.tables());
     tables.extend(observer.zenoh.tables());
     tables.push(observer.measure.links.tables());
+    tables.push(observer.measure.tls.tables());
     tables.extend(observer.derive.robot.tables());
     tables.push(observer.derive.stamps.table());
     tables.extend(observer.derive.clocks.tables());

@@ -1,7 +1,7 @@
 //! Reports of ever new processes, handles and states, some of them of an announced participant.
 
 use super::*;
-use ros2probe_model::facts::calls::late::{LateBound, LateCall};
+use ros2probe_model::facts::calls::late::{LateBound, LateCall, Repairs};
 use ros2probe_model::facts::calls::report::{
     CallbackReport, Durations, ProcessReport, PublisherReport, Report, SubscriptionReport,
     ThreadStates, Transition, Trigger,
@@ -98,6 +98,7 @@ fn late(process: u32, dice: &mut Dice, at: Timestamp) -> LateCall {
         },
         delivery: None,
         handoff: None,
+        repairs: Repairs::default(),
         cpu_limits: Arc::new([]),
         stop: None,
         released_by: None,

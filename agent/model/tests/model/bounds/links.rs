@@ -17,12 +17,14 @@ pub(super) fn reports(observer: &mut Observer, dice: &mut Dice, now: u64) {
         address: [number as u8; 16],
         port: (number >> 8) as u16,
     };
+    let flow = Flow {
+        source: place(dice.roll() % (1 << 20)),
+        destination: place(dice.roll() % (1 << 20)),
+    };
+    observer.input(Input::ClientHello(flow));
     observer.input(Input::Link(&LinkReport {
         socket: dice.roll() % 6000,
-        flow: Flow {
-            source: place(dice.roll() % (1 << 20)),
-            destination: place(dice.roll() % (1 << 20)),
-        },
+        flow,
         protocol: LinkProtocol::Zenoh,
         state: host::Link {
             sent: dice.roll() as u32,

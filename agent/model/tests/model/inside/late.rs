@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use ros2probe_model::facts::calls::late::{
     Activity, Blocked, BusyTime, Cause, Handoff, LateBound, LateCall, MessageDelivery,
-    PreviousCall, Stage, Stop, WaitingStates,
+    PreviousCall, Repairs, Stage, Stop, WaitingStates,
 };
 use ros2probe_model::facts::calls::other_thread::{OtherThread, Priority};
 use ros2probe_model::facts::calls::report::{ProcessReport, Report, ThreadStates, Trigger};
@@ -24,7 +24,7 @@ const fn milliseconds(number: u64) -> Duration {
     Duration::from_millis(number)
 }
 
-const fn states(cpu: u64, throttled: u64, runnable: u64, blocked: u64) -> ThreadStates {
+pub(super) const fn states(cpu: u64, throttled: u64, runnable: u64, blocked: u64) -> ThreadStates {
     ThreadStates {
         calls: 1,
         cpu: cpu * 1_000_000,
@@ -46,7 +46,7 @@ fn other(name: &str, process: u32, duration: u64) -> OtherThread {
 }
 
 /// A call of 100 ms with a bound of 20 ms.
-fn call(states: ThreadStates) -> LateCall {
+pub(super) fn call(states: ThreadStates) -> LateCall {
     LateCall {
         process: 7,
         handle: 0x40,
@@ -64,6 +64,7 @@ fn call(states: ThreadStates) -> LateCall {
         },
         delivery: None,
         handoff: None,
+        repairs: Repairs::default(),
         cpu_limits: Arc::new([]),
         stop: None,
         released_by: None,
@@ -215,6 +216,52 @@ fn a_wait_is_divided_by_the_hops_of_the_message() {
     // Its publisher is on another host.
     late.delivery.as_mut().unwrap().sent_before = None;
     assert_eq!(parts(&late)[0], (Stage::Network, Cause::Transit, 30));
+}
+
+#[test]
+fn a_message_that_was_lost_is_late_for_its_retransmission() {
+    let mut late = call_of_a_message();
+    late.repairs.of_message = Some(milliseconds(60));
+    let all = parts(&late);
+    assert_eq!(all[0], (Stage::Publish, Cause::Send, 10));
+    assert_eq!(all[1], (Stage::Network, Cause::Repaired, 20));
+    // Its way is not known otherwise.
+    late.delivery = None;
+    let expected = [
+        (Stage::Network, Cause::Repaired, 30),
+        (Stage::Wait, Cause::Runnable, 4),
+        (Stage::Wait, Cause::Arrival, 56),
+        (Stage::Callback, Cause::Cpu, 5),
+    ];
+    assert_eq!(parts(&late), expected);
+    // The arrival of a message behind another one is not known.
+    late.repairs = Repairs {
+        of_message: None,
+        of_earlier: Some(milliseconds(60)),
+    };
+    assert_eq!(parts(&late)[1], (Stage::Wait, Cause::Arrival, 86));
+}
+
+#[test]
+fn a_message_behind_a_lost_one_waits_in_the_middleware_for_its_retransmission() {
+    let mut late = call_of_a_message();
+    late.repairs.of_earlier = Some(milliseconds(7));
+    let expected = [
+        (Stage::Publish, Cause::Send, 10),
+        (Stage::Network, Cause::Transit, 20),
+        (Stage::Socket, Cause::Throttled, 2),
+        (Stage::Socket, Cause::Runnable, 3),
+        (Stage::Socket, Cause::Queue, 25),
+        (Stage::Receive, Cause::Repaired, 23),
+        (Stage::Wait, Cause::Runnable, 4),
+        (Stage::Wait, Cause::Middleware, 3),
+        (Stage::Callback, Cause::Cpu, 5),
+    ];
+    assert_eq!(parts(&late), expected);
+    // Fragments of its own came later than its last one.
+    late.repairs.of_message = Some(milliseconds(4));
+    assert!(parts(&late).contains(&(Stage::Network, Cause::Repaired, 20)));
+    assert!(parts(&late).contains(&(Stage::Receive, Cause::Repaired, 26)));
 }
 
 #[test]

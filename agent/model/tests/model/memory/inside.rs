@@ -4,7 +4,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ros2probe_daemon::agent_facts::InsideSourceFacts;
-use ros2probe_model::facts::calls::late::{Activity, Blocked, LateBound, LateCall, PreviousCall};
+use ros2probe_model::facts::calls::late::{
+    Activity, Blocked, LateBound, LateCall, PreviousCall, Repairs,
+};
 use ros2probe_model::facts::calls::other_thread::{OtherThread, Priority};
 use ros2probe_model::facts::calls::report::{
     CallbackReport, Durations, ProcessReport, PublisherReport, Report, ThreadStates, Transition,
@@ -109,6 +111,7 @@ fn late(process: u32, now: u64) -> impl Iterator<Item = LateCall> {
         },
         delivery: None,
         handoff: None,
+        repairs: Repairs::default(),
         cpu_limits: Arc::new([]),
         stop: None,
         released_by: None,

@@ -361,29 +361,6 @@ fn in_words(all: &FindingInputs<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
             finding(kind, Severity::Warning, &about, text)
                 .with_remedy("look at the radio, the cable or the load of that link")
         }
-        Diagnosis::SharedMachineId {
-            domain_id,
-            participants,
-        } => {
-            let listed: Vec<_> = participants
-                .iter()
-                .map(|guid| ends.owner_name(*guid))
-                .collect();
-            let text = format!(
-                "Participants with different addresses have one machine id, so they use only shared \
-                 memory with each other: {}",
-                listed.join(", ")
-            );
-            let first = participants.first().map(Guid::to_string);
-            let about = format!("{domain_id}|{}", first.unwrap_or_default());
-            let found = Finding {
-                domain_id: Some(domain_id.0),
-                ..finding(kind, Severity::Warning, &about, text)
-            };
-            found.with_remedy(
-                "sudo rm /etc/machine-id && sudo systemd-machine-id-setup    # on each cloned machine",
-            )
-        }
         Diagnosis::SlowChain {
             topic,
             from,

@@ -38,6 +38,7 @@ use crate::surface::places::Places;
 use ros2probe_api::live::{End, Events, Line, Open, Replay};
 use ros2probe_model::report::snapshot::Transport;
 use shared_lines::SharedLines;
+pub(super) use structure::is_shown;
 
 /// Maximum number of streams of all listeners. The maximum is lower than that of connections, so
 /// that other requests still get a connection.
@@ -164,6 +165,7 @@ fn open(context: &Context, state: &Known, access: String) -> Open {
         interval_seconds: 1,
         history_seconds: context.live.history.as_secs(),
         keeps_history: context.disk_history.is_kept(),
+        has_fleet: context.fleet.is_some(),
         flags: values::FLAG_MEANINGS.map(Into::into).into(),
         passages: Transport::ALL.map(|each| each.label().into()).into(),
         replay,

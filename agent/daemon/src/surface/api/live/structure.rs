@@ -10,6 +10,7 @@ use super::super::endpoint::{texts, vendor};
 use super::super::index::Index;
 use crate::watches::{ActiveWatches, Origin};
 use ros2probe_api::live::{Endpoint, Graph, Node, Participant, Topic};
+use ros2probe_capture::cgroup_paths::container_or_service;
 use ros2probe_model::facts::topic_kind::TopicKind;
 use ros2probe_model::report::snapshot::{EndpointFacts, Snapshot, TopicFacts};
 
@@ -95,6 +96,7 @@ impl Ids {
                 process.id,
                 process.name.as_deref().map(Cow::Borrowed),
                 process.cgroup.as_deref().map(Cow::Borrowed),
+                process.cgroup.as_deref().and_then(container_or_service),
             ));
         }
         let mut nodes: BTreeMap<(DomainId, &str), Vec<u32>> = BTreeMap::new();
@@ -171,7 +173,7 @@ impl Ids {
 }
 
 /// Returns whether the page shows the topic.
-pub(super) fn is_shown(topic: &TopicFacts) -> bool {
+pub(in super::super) fn is_shown(topic: &TopicFacts) -> bool {
     !matches!(
         topic.kind,
         TopicKind::ServiceRequest | TopicKind::ServiceReply | TopicKind::Discovery

@@ -129,7 +129,6 @@ impl Figures<'_> {
                 | Diagnosis::ObservationSuspended { .. }
                 | Diagnosis::RestampingNode { .. }
                 | Diagnosis::BuffersByCpu { .. }
-                | Diagnosis::SharedMachineId { .. }
                 | Diagnosis::LossyLink { .. }
                 | Diagnosis::LogErrors { .. }
                 | Diagnosis::DiagnosticError { .. }

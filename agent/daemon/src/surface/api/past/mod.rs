@@ -5,6 +5,7 @@ mod event_range;
 mod latest;
 mod query;
 mod rates;
+mod selection;
 #[cfg(test)]
 mod tests;
 mod topic;
@@ -36,6 +37,7 @@ use ros2probe_history::{ProcessRow, Span, Store};
 use event_range::EventRange;
 pub(super) use query::TopicRange;
 use query::{TimeRange, read_store};
+use selection::Named;
 pub(super) use topic::show as show_topic;
 pub use writer::HistoryWriter;
 
@@ -60,6 +62,22 @@ struct MomentQuery {
     /// Unix time.
     #[param(minimum = 0, example = 1_790_000_000)]
     at: f64,
+}
+
+/// The moment of a question about an answer, and the part of it that is wanted.
+#[derive(Clone, Debug, Deserialize, IntoParams)]
+#[serde(deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
+struct AnswerQuery {
+    /// Unix time.
+    #[param(minimum = 0, example = 1_790_000_000)]
+    at: f64,
+    /// Only the topics or nodes of this name, as in `/topics/{topic}` and `/nodes/{node}`.
+    #[param(example = "points")]
+    name: Option<String>,
+    /// Domain id of the topics or nodes; by default every domain.
+    #[param(minimum = 0, maximum = 232)]
+    domain_id: Option<u32>,
 }
 
 /// Size and reach of the history on disk
@@ -136,14 +154,16 @@ async fn get_moment(
 /// An answer of the API as it was
 ///
 /// The answer is that of `/parameters`, `/chains` and so on without a query, with hidden names. It is
-/// the last one that was written before `at`, one a minute. Topics have the form of
-/// `/topics/{topic}`, without measurements and histograms, and with the acknowledgements of readers
-/// that lag. Parameters, diagnostics and logs need the same rights as in the present.
+/// the last one that was written before `at`: one a minute, and one every ten minutes in the part of
+/// the history without seconds. Topics have the form of `/topics/{topic}`, without measurements and
+/// histograms, and with the acknowledgements of readers that lag; those of services and discovery are
+/// left out. With `name` or `domain_id`, the list of topics or nodes has only those, or none.
+/// Parameters, diagnostics and logs need the same rights as in the present.
 #[utoipa::path(
     get,
     path = "/history/moment/{noun}",
     tag = "graph",
-    params(("noun" = KeptNoun, Path, description = "The noun."), MomentQuery),
+    params(("noun" = KeptNoun, Path, description = "The noun."), AnswerQuery),
     responses(
         (status = 200, description = "The answer of that time.",
             body = answers::KeptAnswer<'static>),
@@ -151,7 +171,7 @@ async fn get_moment(
             body = ProblemBody, content_type = "application/problem+json"),
         (status = 404, description = "No such answer of that time is kept.",
             body = ProblemBody, content_type = "application/problem+json"),
-        (status = 422, description = "The noun or the time is invalid.",
+        (status = 422, description = "The noun or the time is invalid, or the noun has no names.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
 )]
@@ -159,19 +179,25 @@ async fn get_answer(
     State(context): State<Context>,
     Extension(granted): Extension<Rights>,
     Path(noun): Path<String>,
-    Parameters(moment): Parameters<MomentQuery>,
+    Parameters(question): Parameters<AnswerQuery>,
 ) -> Result<Response, Problem> {
     let noun = labelled("noun", &noun, &KeptNoun::ALL, KeptNoun::label)?;
     granted.require(answers::required_rights(noun))?;
-    let at = query::second(moment.at)?;
+    let at = query::second(question.at)?;
+    let wanted = Named::of(noun, question.name, question.domain_id)?;
     let read = read_store(&context, move |store| {
         // Graph and tables of the moment are those of this time.
-        let time = store.state(at).map_or(at, |state| state.end);
+        let time = store.state_end(at).unwrap_or(at);
         let version = store.document(noun.label(), time)?;
-        (time.saturating_sub(version.at) <= MAX_AGE_S).then_some(version)
+        let is_recent = time.saturating_sub(version.at) <= MAX_AGE_S;
+        let whole = is_recent.then_some(version.content)?;
+        match wanted {
+            Some(wanted) => wanted.part_of(&whole),
+            None => Some(whole),
+        }
     });
-    let (version, _permit) = read.await?;
-    let version = version.ok_or_else(|| {
+    let (answer, _permit) = read.await?;
+    let answer = answer.ok_or_else(|| {
         let detail = format!("no answer of /{} of that time is kept", noun.label());
         Problem::new(Code::NoHistory, detail)
     })?;
@@ -179,7 +205,7 @@ async fn get_answer(
         (CACHE_CONTROL, "no-store"),
         (CONTENT_TYPE, "application/json"),
     ];
-    Ok(in_turn(&context, async { (headers, version.content) }).await)
+    Ok(in_turn(&context, async { (headers, answer) }).await)
 }
 
 /// CPU time and memory of the robot's processes

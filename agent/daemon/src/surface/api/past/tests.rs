@@ -12,8 +12,9 @@ use ros2probe_api::doctor::{Report, Severity};
 use ros2probe_api::history::KeptNoun;
 use ros2probe_api::topics::TopicDetailsList;
 use ros2probe_capture::reassembly::Limits;
+use ros2probe_model::facts::topic_kind::TopicKind;
 use ros2probe_model::report::snapshot::Snapshot;
-use ros2probe_testing::repository;
+use ros2probe_testing::{repository, sample_robot};
 
 use super::super::security::Rights;
 use super::super::{Context, Doctor, nouns};
@@ -126,6 +127,33 @@ fn answers_take_no_more_than_their_room() {
     }
 }
 
+/// Earlier, the services of 200 nodes took all the room, and the topics of the robot were missing.
+#[test]
+fn topics_of_services_take_no_room_of_the_others() {
+    let directory = tempfile::tempdir().unwrap();
+    let context = context(directory.path());
+    let mut snapshot = sample_robot::snapshot(["/imu"]);
+    for (kind, dds_name) in [
+        (TopicKind::ServiceRequest, "rq/goRequest"),
+        (TopicKind::ServiceReply, "rr/goReply"),
+        (TopicKind::Discovery, "ros_discovery_info"),
+        (TopicKind::Dds, "raw"),
+    ] {
+        let mut topic = sample_robot::topic("/go");
+        (topic.kind, topic.dds_name) = (kind, dds_name.into());
+        snapshot.topics.push(topic);
+    }
+    let agent = context.latest.state().agent.clone();
+    let snapshot = Some(Arc::new(snapshot));
+    let state = State { snapshot, agent };
+    let mut documents = answers::of_state(&context, &state, usize::MAX);
+    let topics = documents.find(|document| document.name == "topics");
+    let topics = topics.unwrap().content;
+    let kept: TopicDetailsList<'_> = serde_json::from_slice(&topics).unwrap();
+    let names = kept.topics.iter().map(|each| each.topic.dds_name.clone());
+    assert_eq!(names.collect::<Vec<_>>(), ["rt/imu", "raw"]);
+}
+
 #[tokio::test]
 async fn an_answer_of_the_past_is_found_after_a_restart_by_clients_with_its_rights() {
     let directory = tempfile::tempdir().unwrap();
@@ -158,7 +186,15 @@ async fn an_answer_of_the_past_is_found_after_a_restart_by_clients_with_its_righ
     }
     let (_, topics) = ask(&context, Access::Read, "/history/moment/topics?at=61").await;
     serde_json::from_slice::<TopicDetailsList<'_>>(&topics).unwrap();
-    for path in ["/history/moment/doctor?at=61", "/history/moment/logs?at=-1"] {
+    let path = "/history/moment/topics?at=61&name=/imu&domain_id=0";
+    let (status, one) = ask(&context, Access::Read, path).await;
+    let one: TopicDetailsList<'_> = serde_json::from_slice(&one).unwrap();
+    assert!(status == StatusCode::OK && one.topics.is_empty());
+    for path in [
+        "/history/moment/doctor?at=61",
+        "/history/moment/logs?at=-1",
+        "/history/moment/logs?at=61&name=/imu",
+    ] {
         let (status, _) = ask(&context, Access::All, path).await;
         assert_eq!(status, StatusCode::UNPROCESSABLE_ENTITY, "{path}");
     }

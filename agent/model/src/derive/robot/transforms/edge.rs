@@ -124,6 +124,9 @@ pub struct EdgeFacts {
     pub count: u64,
     /// Transforms per second over the last ten; `None` in the first second, and for a static edge.
     pub rate: Option<f64>,
+    /// Longest of the latest times between two transforms; each transform shortens it by an eighth,
+    /// until a longer one follows. `None` before the second transform, and for a static edge.
+    pub longest_interval: Option<Duration>,
     /// Time of the last transform.
     pub at: ModelTime,
     /// Seconds and nanoseconds of its stamp.
@@ -336,6 +339,7 @@ impl Edge {
                 .collect(),
             count: self.count,
             rate,
+            longest_interval: self.interval.filter(|_| !last.is_static),
             at: last.at,
             stamp: last.stamp,
             pose: last.pose,

@@ -1,12 +1,12 @@
 //! What distinguishes a robot from the others.
 
+use std::cmp::Ordering;
 use std::collections::{BTreeMap, BTreeSet};
-use std::fmt;
 
-use serde::Serialize;
+use ros2probe_api::fleet::{Difference, PRESENT, Part};
 
-/// Minimum number of robots for a comparison: of two, none is usual.
-const MIN_ROBOTS: usize = 3;
+/// Minimum number of robots in reach for a comparison: of two, none is usual.
+pub(super) const MIN_ROBOTS: usize = 3;
 /// Fraction of the usual rate by which another may differ.
 const RATE_TOLERANCE: f64 = 0.2;
 /// Rates below this one, in hertz, are not compared: an interval has too few messages.
@@ -19,38 +19,6 @@ pub(super) enum Trait {
     Text(String),
     /// A rate.
     Hertz(f64),
-}
-
-/// A property in which a robot differs from most others.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Difference {
-    /// Name of the property.
-    pub what: String,
-    /// Its value; `None` = the robot does not have it.
-    pub here: Option<String>,
-    /// The usual value; `None` = the others do not have it.
-    pub usual: Option<String>,
-    /// Number of robots with the usual value.
-    pub robots: usize,
-    /// Number of compared robots.
-    pub of: usize,
-}
-
-impl fmt::Display for Difference {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self {
-            what, robots, of, ..
-        } = self;
-        match (&self.here, &self.usual) {
-            (None, Some(usual)) if usual == "present" => write!(f, "{what} is missing")?,
-            (Some(here), None) if here == "present" => write!(f, "{what} is only here")?,
-            (None, Some(usual)) => write!(f, "{what}: none, usually {usual}")?,
-            (Some(here), None) => write!(f, "{what}: {here}, usually none")?,
-            (Some(here), Some(usual)) => write!(f, "{what}: {here}, usually {usual}")?,
-            (None, None) => write!(f, "{what}")?,
-        }
-        write!(f, " ({robots} of {of})")
-    }
 }
 
 /// Returns the differences of each robot. A value is usual if more than half of all robots have it.
@@ -74,33 +42,62 @@ pub(super) fn find(
         let count = values.iter().filter(|(_, value)| same(*value)).count();
         for (name, here) in values.iter().filter(|(_, value)| !same(*value)) {
             found.entry((*name).clone()).or_default().push(Difference {
+                part: part(what),
                 what: what.clone(),
                 here: here.map(text),
                 usual: usual.map(text),
                 robots: count,
                 of: robots.len(),
+                text: String::new(),
             });
         }
     }
     for differences in found.values_mut() {
         drop_details(differences);
+        for difference in differences {
+            difference.text = difference.to_string();
+        }
     }
     found
 }
 
 /// Returns the value that more than half of the robots have.
 fn majority_value<'a>(values: &[(&String, Option<&'a Trait>)]) -> Option<Option<&'a Trait>> {
-    let candidates = values.iter().map(|(_, value)| *value);
-    candidates
-        .map(|candidate| {
-            let same = values
-                .iter()
-                .filter(|(_, value)| is_same(*value, candidate));
-            (candidate, same.count())
-        })
+    let mut sorted: Vec<_> = values.iter().map(|(_, value)| *value).collect();
+    sorted.sort_by(|one, two| {
+        order(*one)
+            .total_cmp(&order(*two))
+            .then_with(|| text_order(*one, *two))
+    });
+    // Equal values are side by side, and so are similar rates.
+    let same = |candidate: Option<&Trait>, place: usize| {
+        let (before, after) = sorted.split_at_checked(place)?;
+        let first = before.partition_point(|value| !is_same(*value, candidate));
+        let end = after.partition_point(|value| is_same(*value, candidate));
+        Some(place + end - first)
+    };
+    let counted = sorted.iter().enumerate();
+    counted
+        .filter_map(|(place, candidate)| Some((*candidate, same(*candidate, place)?)))
         .max_by_key(|(_, count)| *count)
         .filter(|(_, count)| count * 2 > values.len())
         .map(|(candidate, _)| candidate)
+}
+
+/// Returns the place of a value: texts first, then rates, of which a missing one is 0.
+fn order(value: Option<&Trait>) -> f64 {
+    match value {
+        Some(Trait::Text(_)) => f64::NEG_INFINITY,
+        Some(Trait::Hertz(rate)) => *rate,
+        None => 0.0,
+    }
+}
+
+fn text_order(one: Option<&Trait>, two: Option<&Trait>) -> Ordering {
+    match (one, two) {
+        (Some(Trait::Text(one)), Some(Trait::Text(two))) => one.cmp(two),
+        _ => Ordering::Equal,
+    }
 }
 
 fn is_same(one: Option<&Trait>, two: Option<&Trait>) -> bool {
@@ -150,13 +147,29 @@ fn drop_details(differences: &mut Vec<Difference>) {
             difference.what = format!("topic {topic}");
             let present = |value: &mut Option<String>| {
                 if value.is_some() {
-                    *value = Some("present".to_owned());
+                    *value = Some(PRESENT.to_owned());
                 }
             };
             present(&mut difference.here);
             present(&mut difference.usual);
         }
     }
+}
+
+/// Returns the part of a robot that a property belongs to, by the property's name.
+fn part(what: &str) -> Part {
+    let parts = [
+        ("node ", Part::Nodes),
+        ("message type of ", Part::Topics),
+        ("publishers of ", Part::Endpoints),
+        ("subscriptions of ", Part::Endpoints),
+        ("endpoints with ", Part::Endpoints),
+        ("reliability of ", Part::Qos),
+        ("durability of ", Part::Qos),
+        ("rate of ", Part::Rates),
+    ];
+    let found = parts.iter().find(|(prefix, _)| what.starts_with(prefix));
+    found.map_or(Part::Agent, |(_, part)| *part)
 }
 
 fn text(value: &Trait) -> String {
@@ -183,8 +196,37 @@ mod tests {
     fn texts(found: &BTreeMap<String, Vec<Difference>>) -> Vec<(&str, Vec<String>)> {
         let robots = found.iter();
         robots
-            .map(|(name, all)| (name.as_str(), all.iter().map(ToString::to_string).collect()))
+            .map(|(name, all)| {
+                (
+                    name.as_str(),
+                    all.iter().map(|it| it.text.clone()).collect(),
+                )
+            })
             .collect()
+    }
+
+    #[test]
+    fn the_usual_value_is_found_among_many_robots() {
+        let name = String::new();
+        let rates: Vec<_> = (0..1000)
+            .map(|number| Trait::Hertz(10.0 + f64::from(number % 3)))
+            .collect();
+        let missing = (0..400).map(|_| None);
+        let values: Vec<_> = rates
+            .iter()
+            .map(Some)
+            .chain(missing)
+            .map(|it| (&name, it))
+            .collect();
+        let usual = majority_value(&values).unwrap().unwrap();
+        assert!(is_same(Some(usual), Some(&Trait::Hertz(11.0))), "{usual:?}");
+        let texts: Vec<_> = (0..1000)
+            .map(|number| Trait::Text((number % 2).to_string()))
+            .collect();
+        let values: Vec<_> = texts.iter().map(|it| (&name, Some(it))).collect();
+        assert_eq!(majority_value(&values), None);
+        let values = [(&name, None), (&name, None), (&name, texts.first())];
+        assert_eq!(majority_value(&values), Some(None));
     }
 
     #[test]

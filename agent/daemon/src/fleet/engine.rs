@@ -16,13 +16,12 @@ use hyper_util::rt::TokioExecutor;
 use percent_encoding::{NON_ALPHANUMERIC, utf8_percent_encode};
 use serde::Deserialize;
 use std::collections::BTreeMap;
-use tokio::runtime::{Builder, Runtime};
 use tokio::time::timeout;
 
 /// Maximum wait for an answer.
 const TIMEOUT: Duration = Duration::from_secs(30);
-/// Maximum length of an answer, in bytes.
-const MAX_BYTES: usize = 64 << 20;
+/// Maximum length of an answer for a command, in bytes.
+pub const MAX_BYTES: usize = 64 << 20;
 
 /// Labels of a series without its name.
 pub(super) type Labels = BTreeMap<String, String>;
@@ -32,8 +31,9 @@ pub(super) type Labels = BTreeMap<String, String>;
 pub struct Engine {
     query: Uri,
     token: Option<HeaderValue>,
+    /// Maximum length of an answer, in bytes.
+    max_bytes: usize,
     client: HttpClient,
-    runtime: Runtime,
 }
 
 /// A client with or without encryption. Only the former needs the certificate authorities of this
@@ -55,7 +55,7 @@ pub enum EngineError {
     /// The address is none.
     #[error(transparent)]
     Address(#[from] InvalidAddress),
-    /// The certificate authorities of this host cannot be read, or no runtime starts.
+    /// The certificate authorities of this host cannot be read.
     #[error("cannot prepare the request")]
     Prepare(#[source] io::Error),
     /// The token cannot be part of a request.
@@ -124,26 +124,34 @@ impl FromStr for Address {
     }
 }
 
+/// Returns whether a text is the URL of an engine.
+#[must_use]
+pub fn is_engine(text: &str) -> bool {
+    text.parse::<Address>().is_ok()
+}
+
 impl Engine {
-    /// Creates a client of the engine at a URL, with a bearer token if it demands one.
+    /// Creates a client of the engine at a URL, with a bearer token if it demands one. It refuses
+    /// longer answers.
     ///
     /// # Errors
     ///
     /// Fails if the URL or the token is invalid.
-    pub fn new(url: &str, token: Option<&str>) -> Result<Self, EngineError> {
+    pub fn new(url: &str, token: Option<&str>, max_bytes: usize) -> Result<Self, EngineError> {
         let address: Address = url.parse()?;
-        let token = token.map(|token| {
+        let token = token.map(|token| -> Result<_, EngineError> {
             let value = HeaderValue::try_from(format!("Bearer {}", token.trim()));
-            value.map_err(|_| EngineError::Token)
+            let mut value = value.map_err(|_| EngineError::Token)?;
+            value.set_sensitive(true);
+            Ok(value)
         });
         let query = address.query();
         let client = HttpClient::of(&query).map_err(EngineError::Prepare)?;
-        let runtime = Builder::new_current_thread().enable_all().build();
         Ok(Self {
             query,
             token: token.transpose()?,
+            max_bytes,
             client,
-            runtime: runtime.map_err(EngineError::Prepare)?,
         })
     }
 
@@ -152,7 +160,7 @@ impl Engine {
     /// # Errors
     ///
     /// Fails if the engine cannot be reached, or refuses the query.
-    pub(super) fn query(&self, expression: &str) -> Result<Vec<(Labels, f64)>, EngineError> {
+    pub(super) async fn query(&self, expression: &str) -> Result<Vec<(Labels, f64)>, EngineError> {
         let encoded = utf8_percent_encode(expression, NON_ALPHANUMERIC);
         let mut request = Request::new(Full::new(Bytes::from(format!("query={encoded}"))));
         *request.method_mut() = hyper::Method::POST;
@@ -169,7 +177,9 @@ impl Engine {
             let answer = self.client.request(request).await;
             let answer = answer.map_err(EngineError::Connection)?;
             let status = answer.status();
-            let body = Limited::new(answer.into_body(), MAX_BYTES).collect().await;
+            let body = Limited::new(answer.into_body(), self.max_bytes)
+                .collect()
+                .await;
             let body = body.map_err(EngineError::Body)?.to_bytes();
             if status.is_success() {
                 return Ok(body);
@@ -178,11 +188,8 @@ impl Engine {
             let text = text.trim().chars().take(200).collect();
             Err(EngineError::Status(status, text))
         };
-        let body = self.runtime.block_on(async {
-            let answered = timeout(TIMEOUT, answered).await;
-            answered.unwrap_or(Err(EngineError::Slow))
-        })?;
-        read(&body)
+        let answered = timeout(TIMEOUT, answered).await;
+        read(&answered.unwrap_or(Err(EngineError::Slow))?)
     }
 }
 

@@ -2,13 +2,13 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use serde::Serialize;
+use ros2probe_api::fleet::{Comparison, Difference, Fleet, PRESENT, Robot, State};
 
-use super::differences::{self, Difference, Trait};
+use super::differences::{self, MIN_ROBOTS, Trait};
 use super::engine::{Engine, EngineError, Labels};
 
 /// Which robots, and how far back.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Question {
     /// Value of the label `job`.
     pub job: String,
@@ -18,72 +18,20 @@ pub struct Question {
     pub reach: u32,
 }
 
-/// The robots of a fleet, those in most trouble first.
-#[derive(Debug, Serialize)]
-pub struct Fleet {
-    /// Robots.
-    pub robots: Vec<Robot>,
-}
-
-/// State of a robot, the worst one first.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum State {
-    /// No sample arrived lately.
-    OutOfReach,
-    /// Its agent captures no packets, or its figures are old.
-    NotReady,
-    /// Expectations are violated.
-    Violated,
-    /// There are findings about its graph.
-    Findings,
-    /// None of these.
-    Ok,
-}
-
-/// A robot.
-#[derive(Debug, Serialize)]
-pub struct Robot {
-    /// Value of the label `instance`.
-    pub name: String,
-    /// Its state.
-    pub state: State,
-    /// Age of its last sample in seconds.
-    pub age_s: f64,
-    /// Version of its agent.
-    pub version: Option<String>,
-    /// Number of nodes.
-    pub nodes: usize,
-    /// Number of topics.
-    pub topics: usize,
-    /// Fraction of the messages of the last 5 minutes that subscribers lost.
-    pub loss: Option<f64>,
-    /// Violated expectations: topic and expectation.
-    pub violated: Vec<(String, String)>,
-    /// Findings by kind, without unmatched endpoints, which healthy robots have, too.
-    pub findings: BTreeMap<String, u64>,
-    /// What differs from the other robots.
-    pub differences: Vec<Difference>,
+impl Default for Question {
+    fn default() -> Self {
+        Self {
+            job: "ros2probe".to_owned(),
+            hours: 24,
+            reach: 60,
+        }
+    }
 }
 
 /// Values of series.
 type Samples = Vec<(Labels, f64)>;
 /// By robot.
 type ByRobot<T> = BTreeMap<String, T>;
-
-impl State {
-    /// Returns the label that `rp fleet` prints.
-    #[must_use]
-    pub const fn label(self) -> &'static str {
-        match self {
-            Self::OutOfReach => "out of reach",
-            Self::NotReady => "not ready",
-            Self::Violated => "violated",
-            Self::Findings => "findings",
-            Self::Ok => "ok",
-        }
-    }
-}
 
 /// Answers of the engine about the whole fleet, by robot.
 #[derive(Default)]
@@ -104,60 +52,67 @@ struct Answers {
     findings: ByRobot<Samples>,
 }
 
-impl Fleet {
-    /// Queries an engine.
-    ///
-    /// # Errors
-    ///
-    /// Fails if the engine cannot be reached, or refuses a query.
-    pub fn read(engine: &Engine, question: &Question) -> Result<Self, EngineError> {
-        let answers = Answers::query(engine, question)?;
-        let reach = f64::from(question.reach);
-        let in_reach = answers.ages.iter().filter(|(_, age)| {
-            let age = value(age);
-            age.is_some_and(|age| age < reach)
-        });
-        let traits = in_reach.map(|(name, _)| (name.clone(), answers.traits(name)));
-        let mut differences = differences::find(&traits.collect());
-        let robots = answers.ages.keys().map(|name| {
-            let differences = differences.remove(name).unwrap_or_default();
-            answers.robot(name, reach, differences)
-        });
-        let mut robots: Vec<_> = robots.collect();
-        robots.sort_by(|one, two| (one.state, &one.name).cmp(&(two.state, &two.name)));
-        Ok(Self { robots })
-    }
+/// Queries an engine for the robots of a fleet.
+///
+/// # Errors
+///
+/// Fails if the engine cannot be reached, or refuses a query.
+pub async fn read(engine: &Engine, question: &Question) -> Result<Fleet, EngineError> {
+    let answers = Answers::query(engine, question).await?;
+    let reach = f64::from(question.reach);
+    let in_reach = answers.ages.iter().filter(|(_, age)| {
+        let age = value(age);
+        age.is_some_and(|age| age < reach)
+    });
+    let traits = in_reach.map(|(name, _)| (name.clone(), answers.traits(name)));
+    let traits = traits.collect();
+    let mut differences = differences::find(&traits);
+    let robots = answers.ages.keys().map(|name| {
+        let differences = differences.remove(name).unwrap_or_default();
+        answers.robot(name, reach, differences)
+    });
+    let mut robots: Vec<_> = robots.collect();
+    robots.sort_by(|one, two| (one.state, &one.name).cmp(&(two.state, &two.name)));
+    Ok(Fleet {
+        robots,
+        comparison: Comparison {
+            in_reach: traits.len(),
+            minimum: MIN_ROBOTS,
+        },
+        incidents: None,
+    })
 }
 
 impl Answers {
-    fn query(engine: &Engine, question: &Question) -> Result<Self, EngineError> {
+    async fn query(engine: &Engine, question: &Question) -> Result<Self, EngineError> {
         let job = format!("job={}", quoted(&question.job));
-        let ask = |expression: &str| {
+        let ask = async |expression: &str| {
             let expression = expression.replace("$JOB", &job);
-            Ok::<_, EngineError>(by_robot(engine.query(&expression)?))
+            Ok::<_, EngineError>(by_robot(engine.query(&expression).await?))
         };
         let hours = question.hours;
         Ok(Self {
             ages: ask(&format!(
                 "time() - max by (instance) (max_over_time(timestamp(ros2probe_ready{{$JOB}})[10m:5s]) \
                  or max_over_time(timestamp(ros2probe_ready{{$JOB}})[{hours}h:1m]))"
-            ))?,
-            ready: ask("min by (instance) (ros2probe_ready{$JOB})")?,
-            versions: ask("ros2probe_build_info{$JOB}")?,
-            nodes: ask("group by (instance, ros_node) (ros2_node_info{$JOB})")?,
+            ))
+            .await?,
+            ready: ask("min by (instance) (ros2probe_ready{$JOB})").await?,
+            versions: ask("ros2probe_build_info{$JOB}").await?,
+            nodes: ask("group by (instance, ros_node) (ros2_node_info{$JOB})").await?,
             topics: ask(
                 "group by (instance, topic, message_type, reliability, durability) \
                  (ros2_topic_info{$JOB,kind=\"topic\"})",
-            )?,
-            publishers: ask("sum by (instance, topic) (ros2_topic_publishers{$JOB})")?,
-            subscriptions: ask("sum by (instance, topic) (ros2_topic_subscriptions{$JOB})")?,
-            rates: ask("sum by (instance, topic) (rate(ros2_topic_messages_total{$JOB}[2m]))")?,
+            ).await?,
+            publishers: ask("sum by (instance, topic) (ros2_topic_publishers{$JOB})").await?,
+            subscriptions: ask("sum by (instance, topic) (ros2_topic_subscriptions{$JOB})").await?,
+            rates: ask("sum by (instance, topic) (rate(ros2_topic_messages_total{$JOB}[2m]))").await?,
             losses: ask(
                 "sum by (instance) (increase(ros2_topic_subscriber_lost_messages_total{$JOB}[5m])) / \
                  sum by (instance) (increase(ros2_topic_subscriber_expected_messages_total{$JOB}[5m]))",
-            )?,
-            violated: ask("ros2_watch_expectation_violated{$JOB} == 1")?,
-            findings: ask("sum by (instance, kind) (ros2_diagnoses{$JOB}) > 0")?,
+            ).await?,
+            violated: ask("ros2_watch_expectation_violated{$JOB} == 1").await?,
+            findings: ask("sum by (instance, kind) (ros2_diagnoses{$JOB}) > 0").await?,
         })
     }
 
@@ -177,7 +132,7 @@ impl Answers {
         }
         for (labels, _) in of(&self.nodes, name) {
             let node = common(labels, "ros_node", name);
-            text(format!("node {node}"), "present".to_owned());
+            text(format!("node {node}"), PRESENT.to_owned());
         }
         for (labels, _) in of(&self.topics, name) {
             let topic = common(labels, "topic", name);
@@ -244,6 +199,7 @@ impl Answers {
             violated: violated.collect(),
             findings: findings.collect(),
             differences,
+            page: None,
         };
         if robot.age_s < reach {
             let ready = value(of(&self.ready, name));
@@ -321,25 +277,6 @@ fn without_number(token: &str) -> String {
 /// Returns a text as a string of PromQL.
 fn quoted(text: &str) -> String {
     format!("\"{}\"", text.replace('\\', "\\\\").replace('"', "\\\""))
-}
-
-#[cfg(test)]
-impl Robot {
-    /// Returns a robot for tests, without findings and differences.
-    pub(super) fn sample(name: &str, state: State, age_s: f64) -> Self {
-        Self {
-            name: name.to_owned(),
-            state,
-            age_s,
-            version: Some("0.1.0".to_owned()),
-            nodes: 5,
-            topics: 7,
-            loss: Some(0.0125),
-            violated: Vec::new(),
-            findings: BTreeMap::new(),
-            differences: Vec::new(),
-        }
-    }
 }
 
 #[cfg(test)]
