@@ -66,8 +66,6 @@ impl ParameterId {
     pub const PRODUCT_VERSION: Self = Self(0x8000);
     /// Version of Cyclone DDS, host and system, as text.
     pub const CYCLONE_VERSION_INFO: Self = Self(0x8007);
-    /// Machine id of Fast DDS 3.2 and later.
-    pub const FAST_MACHINE_ID: Self = Self(0x8003);
     /// Data sharing of Fast DDS. Neither Cyclone DDS nor ADLINK's stack uses this number.
     pub const FAST_DATASHARING: Self = Self(0x8006);
     /// Related sample identity of Fast DDS. Cyclone DDS uses the same number for subscription keys.

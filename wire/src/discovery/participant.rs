@@ -27,8 +27,6 @@ const MAX_NAME_LEN: usize = 256;
 
 /// Maximum length of the version of Cyclone DDS, in bytes.
 const MAX_VERSION_LEN: usize = 32;
-/// Maximum length of a machine's id, in bytes; that of Linux has 32.
-const MAX_MACHINE_ID: usize = 64;
 
 /// Bit set of a participant's builtin endpoints (RTPS 2.5, 9.3.2.12).
 #[derive(Clone, Copy, Default, PartialEq, Eq, Hash, Debug)]
@@ -77,8 +75,6 @@ pub struct ParticipantAnnouncement {
     /// Version of its implementation, such as `0.10.2`: Cyclone DDS, Fast DDS 3.0 and later, and
     /// RTI Connext announce it.
     pub product_version: Option<Box<str>>,
-    /// Fast DDS 3.2 and later: id of its machine (machine-id(5)), which decides who is on its host.
-    pub machine_id: Option<Box<str>>,
     /// Whether it authenticates its peers (DDS Security); its further discovery data may be
     /// encrypted.
     pub is_secured: bool,
@@ -127,7 +123,6 @@ impl ParticipantAnnouncement {
             default_multicast: Vec::new(),
             builtin_endpoints: BuiltinEndpoints::default(),
             product_version: None,
-            machine_id: None,
             is_secured: false,
             is_truncated: false,
         }
@@ -200,10 +195,6 @@ impl ParticipantAnnouncement {
             }
             ParameterId::BUILTIN_ENDPOINT_SET => {
                 self.builtin_endpoints = BuiltinEndpoints(value.u32("PID_BUILTIN_ENDPOINT_SET")?);
-            }
-            ParameterId::FAST_MACHINE_ID if self.vendor == VendorId::EPROSIMA => {
-                let id = text::name(&mut value, "PID_MACHINE_ID", MAX_MACHINE_ID).ok();
-                self.machine_id = id.filter(|id| !id.is_empty()).map(Into::into);
             }
             ParameterId::PRODUCT_VERSION
                 if [VendorId::EPROSIMA, VendorId::RTI_CONNEXT].contains(&self.vendor) =>

@@ -78,8 +78,6 @@ pub struct ParticipantProxy {
     pub announces_by_tcp: bool,
     /// Version of its implementation, if announced.
     pub product_version: Option<Arc<str>>,
-    /// Id of its machine, which Fast DDS 3.2 and later announces.
-    pub machine_id: Option<Arc<str>>,
 }
 
 /// Unicast addresses of a participant.
@@ -229,7 +227,6 @@ impl ParticipantProxy {
             tcp: Locator::are_tcp(&announcement.default_unicast),
             announces_by_tcp: Locator::are_tcp(&announcement.metatraffic_unicast),
             product_version: announcement.product_version.as_deref().map(Into::into),
-            machine_id: announcement.machine_id.as_deref().map(Into::into),
         }
     }
 }

@@ -65,8 +65,6 @@ pub struct Remembered {
     relayers: Option<Vec<String>>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     product_version: Option<String>,
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    machine_id: Option<String>,
     addresses: Addresses,
     nodes: Vec<RememberedNode>,
     /// Writer and number of the sample that announced the nodes.
@@ -225,7 +223,6 @@ impl Remembered {
                 prefixes.collect()
             }),
             product_version: text(&proxy.product_version),
-            machine_id: text(&proxy.machine_id),
             addresses: participant.addresses.clone(),
             nodes: participant.nodes.iter().map(RememberedNode::of).collect(),
             nodes_from: participant
@@ -242,7 +239,6 @@ impl Remembered {
             &self.host,
             &self.process_name,
             &self.product_version,
-            &self.machine_id,
         ];
         let all_plain = texts.into_iter().flatten().all(|text| is_plain(text));
         let domain_id = DomainId::try_from(self.domain_id).ok()?;
@@ -264,7 +260,6 @@ impl Remembered {
                 tcp: self.tcp,
                 announces_by_tcp: self.announces_by_tcp,
                 product_version: text(&self.product_version),
-                machine_id: text(&self.machine_id),
             },
             addresses: self.addresses.clone(),
             restored: Some(now),
