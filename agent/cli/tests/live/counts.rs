@@ -212,12 +212,13 @@ fn point_clouds(stack: Stack, size: usize) -> Result<()> {
         // Every sample whose last datagram left the publisher was seen at least in part.
         assert!(passed + counted.lost >= POINT_CLOUDS - 1, "{}", end.name);
         // A sample is one record. Discovery and the stream's beginning are copied in addition, and
-        // one sample, or a part of it, whose header names its frame.
+        // the samples that are sent until the agent has read from a header which frame it names. A
+        // busy machine lets it wait for a sample or two.
         let share = if size == 2_720_000 { 0.01 } else { 0.02 };
         let copied = end.scrape.sum("ros2probe_capture_copied_bytes_total", &[]);
         let traffic = counted.bytes as f64;
         assert!(
-            copied < traffic * share + size as f64,
+            copied < traffic * share + 3.0 * size as f64,
             "{}: copied {copied} of {traffic} bytes",
             end.name
         );
