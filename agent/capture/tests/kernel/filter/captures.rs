@@ -1,35 +1,51 @@
 //! The kernel programs and user space write the same records for every capture.
 
 use super::*;
+use ros2probe_testing::{corpus, repository};
 use ros2probe_wire::Expansion;
 
 /// One IP packet of a capture.
+#[derive(Clone)]
 pub(super) struct IpPacket {
     pub(super) bytes: Vec<u8>,
     pub(super) time: u64,
 }
 
+/// Returns the captures of the project.
 pub(super) fn captures() -> Vec<PathBuf> {
-    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
     let mut found = Vec::new();
-    for folder in [
-        "wire/tests/data",
-        "agent/testing/data",
-        "../shared/fixtures",
-    ] {
-        collect(&root.join(folder), &mut found);
+    for folder in ["wire/tests/data", "agent/testing/data"] {
+        collect(&repository(folder), &mut found);
     }
-    assert!(
-        found.len() >= 3,
-        "the captures of the project itself are missing: {found:?}"
-    );
+    let found = distinct(found);
+    assert!(found.len() >= 10, "captures are missing: {found:?}");
+    found
+}
+
+/// Returns the captures of the corpus that are not among those of the project.
+fn captures_of_the_corpus() -> Vec<PathBuf> {
+    let own = captures();
+    let mut more = Vec::new();
+    collect(&corpus(), &mut more);
+    let all = [own.clone(), distinct(more)].concat();
+    distinct_in_order(all).split_off(own.len())
+}
+
+fn distinct(mut found: Vec<PathBuf>) -> Vec<PathBuf> {
     // Truncated captures cannot be passed to the kernel as frames.
     found.retain(|path| !path.to_string_lossy().contains("snap256"));
     // This capture has a datagram of 300 submessages, which exceeds a program: user space reads the
     // rest.
     found.retain(|path| !path.to_string_lossy().contains("announced-late"));
     found.sort();
-    found
+    distinct_in_order(found)
+}
+
+/// Returns the paths without those of copies.
+fn distinct_in_order(mut paths: Vec<PathBuf>) -> Vec<PathBuf> {
+    let mut seen = BTreeSet::new();
+    paths.retain(|path| seen.insert(std::fs::read(path).unwrap()));
+    paths
 }
 
 fn collect(folder: &Path, found: &mut Vec<PathBuf>) {
@@ -183,10 +199,25 @@ fn comparable(record: Record) -> Record {
     }
 }
 
-fn compare(path: &Path, hook: Hook, interest: &BTreeMap<Guid, Verdict>) -> (usize, usize) {
-    let packets = ip_packets(path);
-    let mut kernel = Kernel::load_hook(hook);
+/// Changes the sources of packets, so that none continues a flow of an earlier run.
+fn from_elsewhere(packets: &[IpPacket], run: u8) -> Vec<IpPacket> {
+    let mut packets = packets.to_vec();
+    for IpPacket { bytes, .. } in &mut packets {
+        let source = if bytes[0] >> 4 == 4 { 12 } else { 8 };
+        bytes[source] ^= run;
+    }
+    packets
+}
+
+fn compare(
+    path: &Path,
+    packets: &[IpPacket],
+    kernel: &mut Kernel,
+    interest: &BTreeMap<Guid, Verdict>,
+) -> (usize, usize) {
     kernel.set_interest(interest);
+    // Each run has a whole budget.
+    kernel.set_unknown_budget(4 << 20, 1 << 20);
     let (mut user, mut records, mut captures) = (user_space(), 0, 0);
     let mut runs = Runs::default();
     for (number, packet) in packets.iter().enumerate() {
@@ -221,6 +252,7 @@ fn compare(path: &Path, hook: Hook, interest: &BTreeMap<Guid, Verdict>) -> (usiz
     stalled.sort_by_key(|record| (record.writer, record.destination, record.sequence_number));
     wanted.sort_by_key(|record| (record.writer, record.destination, record.sequence_number));
     assert_eq!(stalled, wanted, "{}: runs left over", path.display());
+    kernel.forget_interest(interest);
     (records + stalled.len(), captures)
 }
 
@@ -268,26 +300,42 @@ impl Runs {
     }
 }
 
+/// Returns verdicts for these endpoints: all are metered, or some are and others not.
+fn interests(endpoints: &BTreeSet<Guid>) -> [BTreeMap<Guid, Verdict>; 2] {
+    let endpoints = endpoints.iter().copied();
+    let meter_all = endpoints.clone().map(|guid| (guid, Verdict::Meter));
+    let verdicts = [Verdict::Ignore, Verdict::Meter, Verdict::Capture];
+    let mixed = endpoints.zip(verdicts.into_iter().cycle());
+    [meter_all.collect(), mixed.collect()]
+}
+
 #[test]
 fn the_kernel_and_user_space_make_the_same_records_of_every_capture() {
-    for path in captures() {
-        let all = endpoints(&ip_packets(&path));
-        let meter_all = all.iter().map(|guid| (*guid, Verdict::Meter)).collect();
-        for hook in by_receivers() {
-            let (records, captured) = compare(&path, hook, &meter_all);
-            assert!(captured > 0, "{}: no discovery seen", path.display());
-            let path = path.display();
-            println!("{path}, {hook:?}: {records} records, {captured} captured");
-        }
+    compare_at_interfaces(&captures());
+}
 
-        let verdicts = [Verdict::Ignore, Verdict::Meter, Verdict::Capture];
-        let mixed = all
-            .iter()
-            .copied()
-            .zip(verdicts.into_iter().cycle())
-            .collect();
-        for hook in by_receivers() {
-            compare(&path, hook, &mixed);
+#[test]
+#[ignore = "needs the corpus of captures: make test-corpus"]
+fn the_kernel_and_user_space_make_the_same_records_of_the_whole_corpus() {
+    compare_at_interfaces(&captures_of_the_corpus());
+}
+
+fn compare_at_interfaces(captures: &[PathBuf]) {
+    // The kernel takes half a second to verify a program, so each is loaded only once.
+    let load = |hook| (hook, Kernel::load_hook(hook));
+    let mut kernels: Vec<_> = by_receivers().into_iter().map(load).collect();
+    let mut run = 0;
+    for path in captures {
+        let packets = ip_packets(path);
+        for interest in interests(&endpoints(&packets)) {
+            run += 1;
+            let packets = from_elsewhere(&packets, run);
+            for (hook, kernel) in &mut kernels {
+                let (records, captured) = compare(path, &packets, kernel, &interest);
+                let path = path.display();
+                assert!(captured > 0, "{path}: no discovery seen");
+                println!("{path}, {hook:?}: {records} records, {captured} captured");
+            }
         }
     }
 }
@@ -349,6 +397,7 @@ fn of_any_socket(record: Record) -> Record {
 
 fn compare_host(
     path: &Path,
+    datagrams: &[Datagram],
     kernel: &mut Kernel,
     hook: Hook,
     interest: &BTreeMap<Guid, Verdict>,
@@ -356,7 +405,7 @@ fn compare_host(
     kernel.set_interest(interest);
     let (mut records, mut captures) = (0, 0);
     let mut copied = kernel.counter(Counter::CopiesNotCaptured);
-    for (number, datagram) in datagrams(&ip_packets(path)).into_iter().enumerate() {
+    for (number, datagram) in datagrams.iter().enumerate() {
         let case = format!("{} {hook:?} datagram {number}", path.display());
         let envelope = Envelope {
             outgoing: hook == Hook::Egress,
@@ -420,25 +469,28 @@ fn metered_records(
 
 #[test]
 fn the_host_hook_makes_the_same_records_of_every_capture_in_both_directions() {
-    // The kernel takes half a second to verify a program, so each is loaded only once.
+    compare_at_sockets(&captures());
+}
+
+#[test]
+#[ignore = "needs the corpus of captures: make test-corpus"]
+fn the_host_hook_makes_the_same_records_of_the_whole_corpus_in_both_directions() {
+    compare_at_sockets(&captures_of_the_corpus());
+}
+
+fn compare_at_sockets(captures: &[PathBuf]) {
     let mut kernels = [Hook::Ingress, Hook::Egress].map(|hook| (hook, Kernel::load_hook(hook)));
-    for path in captures() {
-        let all = endpoints(&ip_packets(&path));
-        let meter_all = all.iter().map(|guid| (*guid, Verdict::Meter)).collect();
-        let verdicts = [Verdict::Ignore, Verdict::Meter, Verdict::Capture];
-        let mixed = all
-            .iter()
-            .copied()
-            .zip(verdicts.into_iter().cycle())
-            .collect();
-        for (hook, kernel) in &mut kernels {
-            let (records, captured) = compare_host(&path, kernel, *hook, &meter_all);
-            assert!(captured > 0, "{}: no discovery seen", path.display());
-            println!(
-                "{} {hook:?}: {records} records, {captured} captured",
-                path.display()
-            );
-            compare_host(&path, kernel, *hook, &mixed);
+    for path in captures {
+        let packets = ip_packets(path);
+        let datagrams = datagrams(&packets);
+        for (number, interest) in (0..).zip(interests(&endpoints(&packets))) {
+            for (hook, kernel) in &mut kernels {
+                let (records, captured) = compare_host(path, &datagrams, kernel, *hook, &interest);
+                let path = path.display();
+                // Later, these datagrams may be copies of those just captured.
+                assert!(captured > 0 || number > 0, "{path}: no discovery seen");
+                println!("{path}, {hook:?}: {records} records, {captured} captured");
+            }
         }
     }
 }
