@@ -236,19 +236,26 @@ fn with_prefix(batch: &[u8]) -> Vec<u8> {
 
 /// Writes to one side of a connection, and reads it from the other side.
 fn pass(connection: &mut [TcpStream; 2], by_client: bool, bytes: &[u8]) -> Result<()> {
+    /// Number of bytes that a socket accepts before its peer reads any.
+    const BUFFERED: usize = 8_192;
     let [client, server] = connection;
     let (from, to) = match by_client {
         true => (client, server),
         false => (server, client),
     };
-    let mut reader = to.try_clone()?;
     let mut read = vec![0; bytes.len()];
-    std::thread::scope(|scope| -> Result<()> {
-        let reading = scope.spawn(|| reader.read_exact(&mut read));
+    if bytes.len() <= BUFFERED {
+        // A thread would cost more than the message.
         from.write_all(bytes)?;
-        reading.join().unwrap()?;
-        Ok(())
-    })?;
+        to.read_exact(&mut read)?;
+    } else {
+        std::thread::scope(|scope| -> Result<()> {
+            let reading = scope.spawn(|| to.read_exact(&mut read));
+            from.write_all(bytes)?;
+            reading.join().unwrap()?;
+            Ok(())
+        })?;
+    }
     ensure!(read == bytes, "other bytes arrive");
     Ok(())
 }
