@@ -9,7 +9,7 @@ mod zenoh;
 
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use crate::allocator;
 use ros2probe_capture::border::observe;
@@ -28,7 +28,8 @@ use ros2probe_wire::walk::Envelope;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Record, Timestamp};
 
 const START: u64 = 1_700_000_000_000_000_000;
-const MESSAGES: u64 = 60_000;
+/// The documented caps, each with the test that exceeds it.
+const DRIVEN: &str = include_str!("../../../cli/tests/surface/limits/driven.txt");
 /// Seconds of the history.
 const SECONDS: usize = 20;
 const DISCOVERY_INFO: EntityId = EntityId([0, 0, 2, 3]);
@@ -208,6 +209,7 @@ type Step<'a> = &'a mut dyn FnMut(&mut Observer, &mut Dice, u64);
 
 /// Runs the model with a step every `pause` nanoseconds. Returns the growth of the heap.
 fn drive(messages: u64, pause: u64, step: Step<'_>) -> usize {
+    let begin = Instant::now();
     let mut dice = Dice(0x9e37_79b9_7f4a_7c15);
     let before = allocator::held();
     let mut observer = observer();
@@ -229,7 +231,8 @@ fn drive(messages: u64, pause: u64, step: Step<'_>) -> usize {
         }
     }
     let whole = allocator::held().saturating_sub(before);
-    println!("{half} bytes after half of it, {whole} at the end");
+    let time = begin.elapsed();
+    println!("{half} bytes after half of it, {whole} at the end, in {time:?}");
     whole
 }
 
@@ -421,7 +424,7 @@ fn newcomers_in_a_crowd(observer: &mut Observer, dice: &mut Dice, now: u64) {
 
 #[test]
 fn forged_input_fills_no_table_beyond_its_cap() {
-    let whole = drive(MESSAGES, 200_000, &mut any_datagram);
+    let whole = drive(40_000, 200_000, &mut any_datagram);
     assert_filled(&[
         "discovery.applicants",
         "participants",
@@ -433,7 +436,7 @@ fn forged_input_fills_no_table_beyond_its_cap() {
     ]);
     assert!(whole < 96 << 20, "{whole} bytes");
 
-    let whole = drive(MESSAGES / 3, 1_000_000, &mut one_writer);
+    let whole = drive(15_000, 1_000_000, &mut one_writer);
     assert_filled(&[
         "acknowledgements.readers",
         "sequence.gaps",
@@ -442,11 +445,11 @@ fn forged_input_fills_no_table_beyond_its_cap() {
     ]);
     assert!(whole < 96 << 20, "{whole} bytes");
 
-    let whole = drive(MESSAGES * 2 / 5, 1_000_000, &mut newcomers_in_a_crowd);
+    let whole = drive(15_000, 1_000_000, &mut newcomers_in_a_crowd);
     assert_filled(&["endpoints", "nodes"]);
     assert!(whole < 96 << 20, "{whole} bytes");
 
-    let whole = drive(MESSAGES * 2 / 5, 1_000_000, &mut calls::calls);
+    let whole = drive(15_000, 1_000_000, &mut calls::calls);
     assert_filled(&["services.identities", "services.clients"]);
     assert!(whole < 96 << 20, "{whole} bytes");
 
@@ -454,24 +457,24 @@ fn forged_input_fills_no_table_beyond_its_cap() {
     assert_filled(&["inside.states"]);
     assert!(whole < 96 << 20, "{whole} bytes");
 
-    let whole = drive(MESSAGES, 1_000_000, &mut chains::messages);
+    let whole = drive(20_000, 1_000_000, &mut chains::messages);
     let filled = ["chains", "chains.publications", "chains.spans"];
     assert_filled(&filled);
     assert!(whole < 96 << 20, "{whole} bytes");
 
-    let whole = drive(MESSAGES, 1_000_000, &mut zenoh::batches);
+    let whole = drive(30_000, 1_000_000, &mut zenoh::batches);
     assert_filled(&["zenoh_directions"]);
     assert!(whole < 96 << 20, "{whole} bytes");
 
-    let whole = drive(20_000, 1_000_000, &mut links::reports);
+    let whole = drive(8_000, 1_000_000, &mut links::reports);
     assert_filled(&["links"]);
     assert!(whole < 96 << 20, "{whole} bytes");
 
-    let whole = drive(MESSAGES / 3, 10_000_000, &mut robot::logs);
+    let whole = drive(12_000, 10_000_000, &mut robot::logs);
     assert_filled(&["robot_writers", "log_nodes", "log_messages"]);
     assert!(whole < 96 << 20, "{whole} bytes");
 
-    let whole = drive(MESSAGES / 3, 10_000_000, &mut robot::parts);
+    let whole = drive(12_000, 10_000_000, &mut robot::parts);
     assert_filled(&[
         "diagnostics.values",
         "parameter_requests",
@@ -479,7 +482,7 @@ fn forged_input_fills_no_table_beyond_its_cap() {
     ]);
     assert!(whole < 96 << 20, "{whole} bytes");
 
-    let whole = drive(MESSAGES / 3, 10_000_000, &mut robot::states);
+    let whole = drive(12_000, 10_000_000, &mut robot::states);
     assert_filled(&[
         "robot_managed_nodes",
         "robot_frames",
@@ -492,6 +495,11 @@ fn forged_input_fills_no_table_beyond_its_cap() {
 
     let ledger = ledger();
     println!("{ledger:#?}");
+    let test = "/bounds.rs forged_input_fills_no_table_beyond_its_cap";
+    let claims = DRIVEN.lines().filter(|line| line.ends_with(test));
+    let claimed: Vec<_> = claims.filter_map(|line| line.split(' ').next()).collect();
+    assert!(claimed.len() > 40, "{claimed:?}");
+    assert_filled(&claimed);
     let mut empty: Vec<_> = tables::ALL.iter().map(|table| table.name).collect();
     empty.retain(|table| ledger.get(table).is_none_or(|used| used.largest == 0));
     // Other tests fill these tables: `clocks`, `parameters`, `deliveries`, `event`,
@@ -518,7 +526,7 @@ fn forged_input_fills_no_table_beyond_its_cap() {
 #[test]
 fn a_participant_with_ever_new_addresses_keeps_only_the_latest() {
     let prefix = GuidPrefix([9; 12]);
-    let whole = drive(MESSAGES, 20_000, &mut |observer, dice, now| {
+    let whole = drive(10_000, 120_000, &mut |observer, dice, now| {
         let payload = forge::participant_at(prefix, 100, None, &dice.locators());
         let message = Message::from(prefix).data(SPDP, 1, &payload).bytes();
         observer.input(Input::Datagram {

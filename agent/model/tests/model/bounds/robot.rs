@@ -47,7 +47,7 @@ pub(super) fn parts(observer: &mut Observer, dice: &mut Dice, now: u64) {
     let mut prefix = [7; 12];
     prefix[11] = dice.pick(40) as u8;
     let prefix = GuidPrefix(prefix);
-    let (number, kind) = (dice.pick(60), dice.pick(5));
+    let (number, kind) = (dice.pick(20), dice.pick(5));
     let guid = Guid::new(prefix, EntityId([kind as u8, 4, number as u8, 3]));
     let message = Message::from(prefix);
     let (topic, type_name) = [
