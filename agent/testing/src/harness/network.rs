@@ -1,12 +1,16 @@
 //! Hosts: network namespaces joined by a veth pair of MTU 1500 with real checksums, each with a
 //! cgroup for its processes.
 
+use std::fs;
+use std::io::Write as _;
 use std::net::Ipv4Addr;
 use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
 use std::sync::Once;
 use std::sync::atomic::{AtomicU16, Ordering};
 
-use anyhow::Result;
+use anyhow::{Context as _, Result, ensure};
+use ros2probe_capture::netns;
 
 use super::cgroup::{self, Cgroup};
 use super::{PREFIX, remove_leftovers, require, run};
@@ -77,15 +81,14 @@ impl Namespace {
         let host = Namespace::create("robot", next_subnet(), 1, None)?;
         // A browser treats an IPv6 address that is confirmed seconds later as a network change and
         // aborts its requests (ERR_NETWORK_CHANGED).
-        run(&format!(
-            "ip netns exec {} sysctl -qw net.ipv6.conf.default.accept_dad=0",
-            host.name
-        ))?;
-        run(&format!(
-            "ip -n {0} link add {INTERFACE} type veth peer name unplugged",
-            host.name
-        ))?;
-        run(&format!("ip -n {0} link set unplugged up", host.name))?;
+        netns::within(&host.network(), || {
+            fs::write("/proc/sys/net/ipv6/conf/default/accept_dad", "0")
+        })?
+        .context("cannot set accept_dad")?;
+        host.ip(&[
+            &format!("link add {INTERFACE} type veth peer name unplugged"),
+            "link set unplugged up",
+        ])?;
         host.configure(INTERFACE)?;
         Ok(host)
     }
@@ -152,19 +155,37 @@ impl Namespace {
     }
 
     pub(super) fn configure(&self, interface: &str) -> Result<()> {
-        let Namespace { name, address, .. } = self;
-        run(&format!("ip -n {name} link set lo multicast on up"))?;
-        run(&format!(
-            "ip -n {name} addr add {address}/24 dev {interface}"
-        ))?;
-        run(&format!("ip -n {name} link set {interface} up"))?;
-        run(&format!(
-            "ip -n {name} route add 239.0.0.0/8 dev {interface}"
-        ))?;
+        let address = self.address;
+        self.ip(&[
+            "link set lo multicast on up",
+            &format!("addr add {address}/24 dev {interface}"),
+            &format!("link set {interface} up"),
+            &format!("route add 239.0.0.0/8 dev {interface}"),
+        ])?;
         // Otherwise veth carries incomplete checksums, unlike a physical link.
-        run(&format!(
-            "ip netns exec {name} ethtool -K {interface} tx off"
-        ))?;
+        let enter = self.outside().join(" ");
+        run(&format!("{enter} ethtool -K {interface} tx off"))?;
+        Ok(())
+    }
+
+    /// Runs commands of `ip` on this host's network. For each, `ip -n` would create a mount
+    /// namespace, too, whose removal waits for the kernel.
+    fn ip(&self, commands: &[&str]) -> Result<()> {
+        let mut ip = Command::new("nsenter")
+            .args(&self.outside()[1..])
+            .args(["ip", "-batch", "-"])
+            .stdin(Stdio::piped())
+            .stdout(Stdio::null())
+            .stderr(Stdio::piped())
+            .spawn()
+            .context("cannot run nsenter")?;
+        let mut input = ip.stdin.take().context("no input")?;
+        input.write_all(commands.join("\n").as_bytes())?;
+        input.write_all(b"\n")?;
+        drop(input);
+        let output = ip.wait_with_output()?;
+        let errors = String::from_utf8_lossy(&output.stderr);
+        ensure!(output.status.success(), "{commands:?}: {}", errors.trim());
         Ok(())
     }
 }
@@ -184,11 +205,10 @@ impl Namespace {
             (self, UPLINK, address(1)),
             (centre, far.as_str(), address(2)),
         ] {
-            let name = &host.name;
-            run(&format!(
-                "ip -n {name} addr add {address}/24 dev {interface}"
-            ))?;
-            run(&format!("ip -n {name} link set {interface} up"))?;
+            host.ip(&[
+                &format!("addr add {address}/24 dev {interface}"),
+                &format!("link set {interface} up"),
+            ])?;
         }
         Ok(Uplink {
             host: self.name.clone(),
