@@ -155,11 +155,6 @@ fn report(place: &Place) -> Result<String> {
     Ok(page)
 }
 
-/// Returns a script that runs a publisher and a subscriber of `/imu` for some seconds.
-fn healthy(seconds: u32) -> Result<String> {
-    healthy_during(&format!("sleep {seconds}"))
-}
-
 /// Returns a script that runs a publisher and a subscriber of `/imu` until this command ends.
 /// RustDDS drops samples that its history overwrites before they are sent, so the history covers a
 /// busy machine.
@@ -185,7 +180,9 @@ fn a_healthy_robot_passes_and_leaves_complete_artefacts() -> Result<()> {
         "{}watch:\n  - {{topic: /imu, min_rate_hz: 1, max_silence_s: 10, publishers: 1}}\n",
         at_the_sockets_of(&host)
     ))?;
-    let mut process = place.start(&host, &["--fail-on", "warning"], &healthy(14)?)?;
+    let script = format!("echo began; {}", healthy_during("read line")?);
+    let mut process = place.start(&host, &["--fail-on", "warning"], &script)?;
+    end_after(&mut process, 400, Duration::from_secs(13))?;
     let cases = place.end(&mut process, 0)?;
     let failed = cases.failed();
     ensure!(failed.is_empty(), "{failed:?}");
@@ -244,7 +241,9 @@ fn lost_messages_and_a_low_rate_fail_by_the_name_of_the_topic() -> Result<()> {
     driver.wait_matched()?;
     let _loss = Loss::of_samples(&link.robot, &link.monitor, &stream, 100)?;
     driver.start_sending()?;
-    std::thread::sleep(Duration::from_secs(10));
+    wait_until("samples of ten seconds are sent", || {
+        Ok(driver.log()?.sequences("pub").len() >= 2_000)
+    })?;
     process.write_line("end")?;
     let cases = place.end(&mut process, CONDITION_FAILED)?;
     let failed = cases.failed();
@@ -431,8 +430,10 @@ fn a_run_with_more_messages_than_the_bag_may_hold_keeps_a_complete_bag() -> Resu
         "{}recordings: {{max_bytes: 1048576}}\n",
         at_the_sockets_of(&host)
     ))?;
-    let script = healthy(8)?.replace("--size 320", "--size 32000");
+    let robot = healthy_during("read line")?.replace("--size 320", "--size 32000");
+    let script = format!("echo began; {robot}");
     let mut process = place.start(&host, &["--settle", "1", "--max-lost", "any"], &script)?;
+    end_after(&mut process, 300, Duration::from_secs(7))?;
     place.end(&mut process, 0)?;
     let page = report(&place)?;
     ensure!(page.contains("it ended early: "), "{page}");
@@ -524,6 +525,16 @@ fn wait_until_sent(process: &Process, datagrams: u64) -> Result<()> {
     wait_until("datagrams are sent", || Ok(sent()? >= before + datagrams))
 }
 
+/// Lets a command run for this time at least, and until the host has sent this many datagrams. The
+/// command prints `began`, and reads a line at its end. The robot of a busy machine starts late.
+fn end_after(process: &mut Process, datagrams: u64, least: Duration) -> Result<()> {
+    process.wait_for("began", PATIENCE)?;
+    let began = Instant::now();
+    wait_until_sent(process, datagrams)?;
+    std::thread::sleep(least.saturating_sub(began.elapsed()));
+    process.write_line("end")
+}
+
 #[test]
 fn packets_that_the_agent_dropped_are_a_warning_and_fail_a_strict_run() -> Result<()> {
     let host = Namespace::isolated()?;
@@ -582,18 +593,30 @@ fn topics_beyond_a_limit_fail_a_strict_run() -> Result<()> {
         "{}limits: {{topics: 1}}\n",
         at_the_sockets_of(&host)
     ))?;
-    let other = healthy(9)?
+    // A shell in the background has no input.
+    let end = place.path("end");
+    let robot = healthy_during(&format!(
+        "while [ ! -e {} ]; do sleep 0.1; done",
+        end.display()
+    ))?;
+    let other = robot
         .replace("/imu", "/odom")
         .replace("/ekf", "/planner")
         .replace("/driver", "/wheels");
-    let script = format!("({}) & ({other}) & wait", healthy(9)?);
+    let script = format!("echo began; ({robot}) & ({other}) & wait");
     for (option, code, failed) in [
         ("--no-bag", 0, &[][..]),
         ("--strict", CONDITION_FAILED, &["observation completeness"]),
     ] {
         let options = ["--settle", "2", "--max-lost", "any", option];
         let mut process = place.start(&host, &options, &script)?;
+        process.wait_for("began", PATIENCE)?;
+        let began = Instant::now();
+        wait_until_sent(&process, 600)?;
+        std::thread::sleep(Duration::from_secs(8).saturating_sub(began.elapsed()));
+        fs::write(&end, "")?;
         assert_eq!(place.end(&mut process, code)?.failed(), failed);
+        fs::remove_file(&end)?;
         let printed = fs::read_to_string(place.path("said"))?;
         ensure!(
             printed.contains("limits.topics was reached, and "),
