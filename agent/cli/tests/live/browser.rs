@@ -22,6 +22,8 @@ use flate2::read::MultiGzDecoder;
 use past::unix_time;
 use player::{play, play_for, watch};
 use robot::{Place, Robot};
+use ros2probe_testing::harness;
+use ros2probe_testing::harness::agent::get;
 use ros2probe_testing::harness::bpf::interest_of;
 use ros2probe_testing::harness::network::Link;
 use ros2probe_testing::local_agent::{self, LocalAgent};
@@ -394,7 +396,10 @@ fn a_tab_that_slept_for_a_minute_shows_the_present_state() -> Result<()> {
         "a node while hidden" => {
             others.push(place.publisher("/hidden", "/while_hidden")?);
             // The event precedes the next stream.
-            std::thread::sleep(Duration::from_secs(3));
+            harness::wait_until("the event of the node", || {
+                let url = format!("{PAGE}events?after=0&follow=false");
+                Ok(get(&place.host, &url)?.contains("/while_hidden"))
+            })?;
             Ok(json!({}))
         }
         _ => Ok(json!({"live": place.streams()?})),

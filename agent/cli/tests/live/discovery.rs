@@ -18,7 +18,7 @@ const STARTS: usize = 10;
 const NODES: usize = 16;
 /// Maximum time for the start of a whole robot on a busy machine.
 const PATIENCE: Duration = Duration::from_secs(60);
-/// Time for goodbyes, less than the shortest lease, so that no participant has expired.
+/// Time for goodbyes of a robot, less than its lease, so that no participant has expired.
 const LEAVE: Duration = Duration::from_secs(8);
 /// Gives Cyclone DDS a long lease, which a busy machine renews in time, and its usual interval of
 /// announcements.
@@ -85,7 +85,8 @@ fn late_agent_ratio(stack: Stack) -> Result<()> {
     let guid = guid.context("no GUID in the log")?;
     let writer = format!("{}.{}", &guid[..24], &guid[24..]);
     let count = || -> Result<f64> {
-        let page = watcher.agent.scrape()?;
+        let is_fresh = |page: &Scrape| page.sum("ros2probe_snapshot_age_seconds", &[]) < 1.0;
+        let page = watcher.agent.scrape_until("a fresh page", is_fresh)?;
         let writer = [("writer", writer.as_str())];
         let count = page.value("ros2_unknown_writer_messages_total", &writer);
         count.with_context(|| format!("no {writer:?} in {}", page.0))
@@ -181,11 +182,9 @@ fn stopped_nodes_vanish_immediately_and_killed_ones_when_their_lease_ends() -> R
     for (name, peer) in &mut stopping {
         let ended = peer.process.terminate()?;
         assert!(ended.success(), "{name} ended with {ended}");
-        watcher.wait(
-            |page| !nodes(page).contains(*name),
-            LEAVE,
-            "a node that stopped",
-        )?;
+        // The counts below show that no lease ended.
+        let is_gone = |page: &Scrape| !nodes(page).contains(*name);
+        watcher.wait(is_gone, PATIENCE, "a node that stopped")?;
     }
     let page = watcher.agent.scrape()?;
     let went = |event| {
@@ -200,7 +199,7 @@ fn stopped_nodes_vanish_immediately_and_killed_ones_when_their_lease_ends() -> R
     let killed = Instant::now();
     let mut gone: BTreeMap<&str, Duration> = BTreeMap::new();
     while gone.len() < dying.len() {
-        assert!(killed.elapsed() < Duration::from_secs(40), "only {gone:?}");
+        assert!(killed.elapsed() < PATIENCE, "only {gone:?}");
         let page = watcher.agent.scrape()?;
         let there = nodes(&page);
         for name in dying.keys().filter(|name| !there.contains(**name)) {
@@ -209,7 +208,8 @@ fn stopped_nodes_vanish_immediately_and_killed_ones_when_their_lease_ends() -> R
         std::thread::sleep(Duration::from_millis(100));
     }
     for (name, (_, lease, renewal)) in &dying {
-        let expected = Duration::from_secs(lease - renewal)..Duration::from_secs(lease + 8);
+        // A busy machine shows the end late.
+        let expected = Duration::from_secs(lease - renewal)..Duration::from_secs(lease + 20);
         assert!(expected.contains(&gone[name]), "{name}: {gone:?}");
     }
     let page = watcher.agent.scrape()?;

@@ -40,7 +40,7 @@ const API_PORT: u16 = 17401;
 const PATIENCE: Duration = Duration::from_secs(60);
 /// Maximum duration of a shutdown: 3 s for answers and the last round, 2 s for the last export, and
 /// the rest for a busy machine.
-const ENDING: Duration = Duration::from_secs(30);
+const ENDING: Duration = Duration::from_secs(60);
 
 /// An agent on a separate host, with a directory for its files.
 struct FaultBench<'a> {
@@ -97,7 +97,7 @@ impl<'a> FaultBench<'a> {
         let stream = netns::within(&self.agent.host.network(), || {
             TcpStream::connect(("127.0.0.1", port))
         })??;
-        stream.set_read_timeout(Some(Duration::from_secs(20)))?;
+        stream.set_read_timeout(Some(PATIENCE))?;
         Ok(stream)
     }
 

@@ -26,6 +26,9 @@ fn the_history_has_every_message_before_the_end_of_the_agent() -> Result<()> {
     std::thread::sleep(Duration::from_millis(1500));
     let counted = &scene.place.ask("/topics/imu")?["measurement"]["messages"];
     let counted = counted.as_u64().context("no count")?;
+    harness::wait_until("the seconds of all messages", || {
+        Ok(scene.messages("/topics/imu/history")? >= counted)
+    })?;
     ensure!(counted > 100, "{counted}");
     agent.process.terminate()?;
     drop(agent);

@@ -15,6 +15,7 @@ use ros2probe_testing::harness::cgroup;
 use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::peer::{Stack, Stream, pair, robot};
 use ros2probe_testing::harness::process::Process;
+use ros2probe_testing::harness::wait_until;
 use tempfile::TempDir;
 
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -127,7 +128,8 @@ fn a_receiver_is_named_by_process_and_control_group() -> Result<()> {
     );
     let observed = Observed::start(&host, &configuration)?;
     let stream = Stream {
-        linger: 20.0,
+        // Both nodes stay until `rp doctor` has seen them.
+        linger: 120.0,
         ..Stream::small(2000)
     };
     let (mut publisher, subscriber) = pair(&host, &host, Stack::Cyclone, &stream)?;
@@ -370,15 +372,13 @@ fn two_agents_count_the_same_and_a_killed_one_leaves_no_programs_behind() -> Res
     second.agent.process.signal("KILL")?;
     second.agent.process.wait(PATIENCE)?;
     // The kernel releases the descriptors of a killed process asynchronously.
-    let deadline = Instant::now() + PATIENCE;
-    while cgroup::attached(link.robot.cgroup())? != [2, 2] {
-        ensure!(Instant::now() < deadline, "a program stays");
-        std::thread::sleep(Duration::from_millis(20));
-    }
+    let attached = || cgroup::attached(link.robot.cgroup());
+    wait_until("no program of the killed agent", || {
+        Ok(attached()? == [2, 2])
+    })?;
     let Observed { mut agent, .. } = first;
     assert!(agent.process.terminate()?.success());
-    assert_eq!(cgroup::attached(link.robot.cgroup())?, [0, 0]);
-    Ok(())
+    wait_until("no program", || Ok(attached()? == [0, 0]))
 }
 
 /// A host with an agent on it.

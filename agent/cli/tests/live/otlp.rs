@@ -229,7 +229,7 @@ fn spans_of_all_kinds_come(at_robot: &mut Rotel, at_monitor: &mut Rotel) -> Resu
     let (begin, end) = (time("Start time")?, time("End time")?);
     let own = time("source_timestamp_unix_nano")?;
     ensure!(
-        own <= begin && begin < end && end - own < 5_000_000_000,
+        own <= begin && begin < end && end - own < 60_000_000_000,
         "{cloud:?}"
     );
     Ok(())

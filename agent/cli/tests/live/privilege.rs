@@ -417,7 +417,7 @@ fn confined(process: u32, user: u32) -> Result<BTreeSet<String>> {
 /// Sends a stream to the monitor, and returns the page after it. Fails if a sample was lost.
 fn watch_a_stream(link: &Link, agent: &Agent<'_>) -> Result<Scrape> {
     let stream = Stream {
-        linger: 30.0,
+        linger: 120.0,
         ..Stream::small(SAMPLES)
     };
     let mut subscriber = Peer::start(
@@ -437,7 +437,7 @@ fn watch_a_stream(link: &Link, agent: &Agent<'_>) -> Result<Scrape> {
     subscriber.wait_matched()?;
     publisher.wait_matched()?;
     publisher.start_sending()?;
-    publisher.wait_sent(Duration::from_secs(30))?;
+    publisher.wait_sent(Duration::from_secs(60))?;
     let page = agent.settled_scrape("/imu", SAMPLES)?;
     let received = page.sum(
         "ros2_subscriber_received_messages_total",

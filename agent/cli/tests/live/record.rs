@@ -299,7 +299,7 @@ fn a_client_pauses_resumes_splits_and_ends_a_recording(robot: &Robot<'_>) -> Res
             && info.contains(&format!("Messages:          {}\n", recorded.len())),
         "{info}"
     );
-    let events = robot.events("ros2probe.recording.*")?;
+    let events = robot.events_after("ros2probe.recording.*", 2)?;
     let names: Vec<_> = events.iter().map(|event| &event["name"]).collect();
     ensure!(
         names == ["ros2probe.recording.started", "ros2probe.recording.ended"],
@@ -329,7 +329,7 @@ fn snapshots_are_taken_of_silence_and_on_request(robot: &Robot<'_>, imu: &mut Pe
     robot
         .agent
         .scrape_until("a snapshot", |page| written(page) == 1.0)?;
-    let events = robot.events("ros2probe.snapshot.taken")?;
+    let events = robot.events_after("ros2probe.snapshot.taken", 1)?;
     let [taken] = &events[..] else {
         anyhow::bail!("{events:?}");
     };
@@ -382,7 +382,7 @@ fn a_full_storage_ends_a_recording_in_order() -> Result<()> {
     let (_, ended) = robot.ask("DELETE", "/recordings/full", &Value::Null)?;
     let reported = ended["error"].as_str().unwrap_or_default();
     ensure!(reported.starts_with("no space left to write "), "{ended:#}");
-    let events = robot.events("ros2probe.recording.ended")?;
+    let events = robot.events_after("ros2probe.recording.ended", 1)?;
     let reasons: Vec<_> = events
         .iter()
         .map(|event| &event["attributes"]["reason"])

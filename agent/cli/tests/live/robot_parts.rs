@@ -141,10 +141,11 @@ fn diagnostics_have_levels_values_findings_and_a_command_without_a_watch() -> Re
         let page = agent.scrape()?;
         Ok(page.sum("ros2_diagnoses", &[("kind", "diagnostic_error")]) == 1.0)
     })?;
-    assert_eq!(
-        rp(&link.monitor, &["diag", "-l", "error"])?,
-        "ERROR  lidar: connection: no data\n"
-    );
+    wait_until("the error is printed", || {
+        node.say(2, "no data")?;
+        let printed = rp(&link.monitor, &["diag", "-l", "error"])?;
+        Ok(printed == "ERROR  lidar: connection: no data\n")
+    })?;
     node.say(2, "no data")?;
     let verbose = rp(&link.monitor, &["diag", "-v", "lidar"])?;
     assert!(

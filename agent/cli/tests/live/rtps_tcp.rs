@@ -222,7 +222,8 @@ fn samples_that_the_sender_drops_are_lost_at_the_sender() -> Result<()> {
         count: 300,
         depth: 1,
         asynchronous: true,
-        linger: 90.0,
+        // The publisher stays while a browser shows it.
+        linger: 300.0,
         ..cloud
     };
     let monitor = Observer::start(&link.monitor, &at_the_sockets_of(&link.monitor))?;
@@ -260,7 +261,7 @@ fn retransmitted_segments_of_a_link_equal_those_of_the_kernel_and_are_a_finding(
     let stream = Stream {
         count: 3000,
         reliable: true,
-        linger: 60.0,
+        linger: 300.0,
         ..small
     };
     let robot = Observer::start(&link.robot, &at_the_sockets_of(&link.robot))?;
@@ -293,7 +294,7 @@ fn retransmitted_segments_of_a_link_equal_those_of_the_kernel_and_are_a_finding(
     assert!(unsent.is_some(), "{}", page.0);
     let round_trip = page.value("ros2_link_round_trip_seconds", &labels);
     ensure!(
-        round_trip.is_some_and(|time| time > 0.0 && time < 1.0),
+        round_trip.is_some_and(|time| time > 0.0 && time < 10.0),
         "{round_trip:?}"
     );
     publisher.wait_sent(PATIENCE)?;

@@ -155,13 +155,20 @@ fn a_topic_of_two_middlewares_with_a_remote_subscriber_has_all_its_sources() -> 
         talker.start_sending()?;
         std::thread::sleep(Duration::from_secs(1));
     }
+    for peer in [&publisher, &talker] {
+        wait_until("two stretches are sent", || {
+            Ok(peer.log()?.sequences("pub").len() >= 400)
+        })?;
+    }
     // The messages before the first one that the agent saw cannot be counted.
+    agent.settled_scrape("/points", 400)?;
     let before = agent.settled_scrape("/imu", 0)?;
     publisher.start_sending()?;
     talker.start_sending()?;
     publisher.wait_sent(PATIENCE)?;
     talker.wait_sent(PATIENCE)?;
-    let page = agent.settled_scrape("/points", streams.one.count)?;
+    agent.settled_scrape("/points", streams.one.count)?;
+    let page = agent.settled_scrape("/imu", 0)?;
     let more = |topic| {
         let count = |page: &Scrape| page.sum("ros2_topic_messages_total", &[("topic", topic)]);
         count(&page) - count(&before)

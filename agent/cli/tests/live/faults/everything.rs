@@ -477,7 +477,7 @@ fn socket_request(
     body: &str,
 ) -> Result<(u16, Value)> {
     let stream = UnixStream::connect(&doors.socket)?;
-    stream.set_read_timeout(Some(Duration::from_secs(20)))?;
+    stream.set_read_timeout(Some(SENT))?;
     ask(&mut { stream }, method, path, body)
 }
 

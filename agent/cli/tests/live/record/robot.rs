@@ -91,8 +91,18 @@ impl<'a> Robot<'a> {
         Ok((status.parse()?, value))
     }
 
+    /// Returns all events of these names once there are this many.
+    pub(super) fn events_after(&self, names: &str, count: usize) -> Result<Vec<Value>> {
+        let mut events = Vec::new();
+        wait_until(&format!("{count} events {names}"), || {
+            events = self.events(names)?;
+            Ok(events.len() >= count)
+        })?;
+        Ok(events)
+    }
+
     /// Returns all events of these names so far.
-    pub(super) fn events(&self, names: &str) -> Result<Vec<Value>> {
+    fn events(&self, names: &str) -> Result<Vec<Value>> {
         let path = format!("/events?after=0&follow=false&name={names}");
         let text = self.curl("GET", &path, &Value::Null)?;
         let data = text.lines().filter_map(|line| line.strip_prefix("data: "));
