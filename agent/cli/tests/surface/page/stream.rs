@@ -5,6 +5,7 @@ use super::*;
 #[test]
 fn a_stream_begins_with_the_whole_state_and_continues_with_changes() {
     let agent = ended("cyclonedds/points-besteffort-lossy-2ns", &[]);
+    let opened = Instant::now();
     let mut live = Lines::open(agent.api, "/live", "").unwrap_or_else(|_| panic!());
     let first = live.batch();
     let names: Vec<_> = first.iter().map(|(name, _)| name.as_str()).collect();
@@ -43,17 +44,15 @@ fn a_stream_begins_with_the_whole_state_and_continues_with_changes() {
     );
 
     // After the end of the capture nothing changes, and the stream continues.
-    let began = Instant::now();
-    for _ in 0..2 {
+    for number in 2_u32..=3 {
         let batch = live.batch();
         assert_eq!(batch.len(), 1, "{batch:?}");
         assert_eq!(rows(&batch[0].1["topics"]).len(), 0, "{batch:?}");
         assert_eq!(batch[0].1["replay"][1], 1);
+        // A batch of a second, even if this test reads it late.
+        let most = 2.2 + opened.elapsed().as_secs_f64();
+        assert!(f64::from(number) <= most, "batch {number} of {most}");
     }
-    assert!(
-        (1.0..30.0).contains(&began.elapsed().as_secs_f64()),
-        "{began:?}"
-    );
     // A watch changes the structure, but not the figures.
     assert_eq!(call_api(agent.api, "POST", "/watch/another", "").0, 201);
     let batch = live.batch();

@@ -114,19 +114,27 @@ fn a_second_interrupt_ends_a_recording_without_waiting_but_with_its_report() {
     let directory = tempfile::tempdir().unwrap();
     let capture = directory.path().join("many.pcap");
     many_topics(&capture);
-    let agent = LocalAgent::replay(&mut rp(), &capture, &["--speed", "1"]);
-    let bag = directory.path().join("bag");
-    let mut recording = Recording::start(agent.api, &bag, &[]);
-    recording.wait_for("Recording...");
-    wait_for_messages(&agent);
-    // The first signal waits for messages in transit until a time that a replay never reaches.
-    recording.signal("-INT");
-    recording.wait_for("Completing the bag");
-    recording.signal("-INT");
-    let (status, ended) = recording.end();
-    assert_eq!(status.code(), Some(0), "{:#?}", recording.printed);
-    // Without the second signal, it ends 5 s after the first one.
-    assert!(ended < Duration::from_secs(4), "{ended:?}");
+    let (recording, bag) = (1..)
+        .find_map(|attempt| {
+            let agent = LocalAgent::replay(&mut rp(), &capture, &["--speed", "1"]);
+            let bag = directory.path().join(attempt.to_string());
+            let mut recording = Recording::start(agent.api, &bag, &[]);
+            recording.wait_for("Recording...");
+            wait_for_messages(&agent);
+            // The first signal waits for messages in transit until a time that a replay never
+            // reaches.
+            recording.signal("-INT");
+            recording.wait_for("Completing the bag");
+            recording.signal("-INT");
+            let (status, ended) = recording.end();
+            assert_eq!(status.code(), Some(0), "{:#?}", recording.printed);
+            // Without the second signal, it ends 5 s after the first one each time. A busy machine
+            // delays a process once.
+            let is_soon = ended < Duration::from_secs(4);
+            assert!(is_soon || attempt < 3, "{ended:?}");
+            is_soon.then_some((recording, bag))
+        })
+        .unwrap();
     let count: usize = messages(&bag).values().map(Vec::len).sum();
     assert!(count > 0);
     let report = format!("{count} messages in {}", bag.display());
@@ -218,7 +226,7 @@ fn a_third_interrupt_restores_the_terminal() {
     terminal.wait_for("Recording...");
     for _ in 0..3 {
         // Signals of the same kind that arrive together count as one.
-        std::thread::sleep(Duration::from_millis(300));
+        std::thread::sleep(Duration::from_secs(1));
         terminal.signal("-INT");
     }
     assert_eq!(terminal.ends(), Some(2), "{}", terminal.written());
