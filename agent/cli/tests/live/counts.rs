@@ -37,28 +37,13 @@ const LATENCIES: [&str; 2] = [
 static MACHINE: RwLock<()> = RwLock::new(());
 
 #[test]
-fn fast_dds_small_samples_are_all_counted() -> Result<()> {
-    best_effort(Stack::Fast, 0)
+fn fast_dds_small_samples_are_counted_and_counted_as_lost_at_10_and_20_percent() -> Result<()> {
+    best_effort(Stack::Fast)
 }
 
 #[test]
-fn fast_dds_small_samples_lost_at_10_percent_are_counted_as_lost() -> Result<()> {
-    best_effort(Stack::Fast, 100)
-}
-
-#[test]
-fn fast_dds_small_samples_lost_at_20_percent_are_counted_as_lost() -> Result<()> {
-    best_effort(Stack::Fast, 200)
-}
-
-#[test]
-fn fast_dds_reliable_samples_dropped_at_10_percent_are_counted_as_recovered() -> Result<()> {
-    reliable(Stack::Fast, 100)
-}
-
-#[test]
-fn fast_dds_reliable_samples_dropped_at_20_percent_are_counted_as_recovered() -> Result<()> {
-    reliable(Stack::Fast, 200)
+fn fast_dds_reliable_samples_dropped_at_10_and_20_percent_count_as_recovered() -> Result<()> {
+    reliable(Stack::Fast)
 }
 
 #[test]
@@ -72,28 +57,13 @@ fn fast_dds_point_clouds_of_2_72_mb_are_counted_as_recorded_on_the_wire() -> Res
 }
 
 #[test]
-fn cyclone_dds_small_samples_are_all_counted() -> Result<()> {
-    best_effort(Stack::Cyclone, 0)
+fn cyclone_dds_small_samples_are_counted_and_counted_as_lost_at_10_and_20_percent() -> Result<()> {
+    best_effort(Stack::Cyclone)
 }
 
 #[test]
-fn cyclone_dds_small_samples_lost_at_10_percent_are_counted_as_lost() -> Result<()> {
-    best_effort(Stack::Cyclone, 100)
-}
-
-#[test]
-fn cyclone_dds_small_samples_lost_at_20_percent_are_counted_as_lost() -> Result<()> {
-    best_effort(Stack::Cyclone, 200)
-}
-
-#[test]
-fn cyclone_dds_reliable_samples_dropped_at_10_percent_are_counted_as_recovered() -> Result<()> {
-    reliable(Stack::Cyclone, 100)
-}
-
-#[test]
-fn cyclone_dds_reliable_samples_dropped_at_20_percent_are_counted_as_recovered() -> Result<()> {
-    reliable(Stack::Cyclone, 200)
+fn cyclone_dds_reliable_samples_dropped_at_10_and_20_percent_count_as_recovered() -> Result<()> {
+    reliable(Stack::Cyclone)
 }
 
 #[test]
@@ -107,28 +77,13 @@ fn cyclone_dds_point_clouds_of_2_72_mb_are_counted_as_recorded_on_the_wire() -> 
 }
 
 #[test]
-fn rust_dds_small_samples_are_all_counted() -> Result<()> {
-    best_effort(Stack::Rust, 0)
+fn rust_dds_small_samples_are_counted_and_counted_as_lost_at_10_and_20_percent() -> Result<()> {
+    best_effort(Stack::Rust)
 }
 
 #[test]
-fn rust_dds_small_samples_lost_at_10_percent_are_counted_as_lost() -> Result<()> {
-    best_effort(Stack::Rust, 100)
-}
-
-#[test]
-fn rust_dds_small_samples_lost_at_20_percent_are_counted_as_lost() -> Result<()> {
-    best_effort(Stack::Rust, 200)
-}
-
-#[test]
-fn rust_dds_reliable_samples_dropped_at_10_percent_are_counted_as_recovered() -> Result<()> {
-    reliable(Stack::Rust, 100)
-}
-
-#[test]
-fn rust_dds_reliable_samples_dropped_at_20_percent_are_counted_as_recovered() -> Result<()> {
-    reliable(Stack::Rust, 200)
+fn rust_dds_reliable_samples_dropped_at_10_and_20_percent_count_as_recovered() -> Result<()> {
+    reliable(Stack::Rust)
 }
 
 #[test]
@@ -141,88 +96,96 @@ fn rust_dds_point_clouds_of_2_72_mb_are_counted_as_recorded_on_the_wire() -> Res
     point_clouds(Stack::Rust, 2_720_000)
 }
 
-fn best_effort(stack: Stack, per_mille: u16) -> Result<()> {
+/// Streams without loss, with 10 and with 20 % loss.
+fn best_effort(stack: Stack) -> Result<()> {
     let _shared = MACHINE.read().unwrap_or_else(PoisonError::into_inner);
-    let seen = Exchange::of(stack, &Stream::small(SMALL_SAMPLES), per_mille)?;
-    seen.print(stack, per_mille);
-    assert_eq!(seen.sent.sequences("pub").len() as u64, SMALL_SAMPLES);
-    let received: BTreeSet<u64> = seen.received.sequences("sub").into_iter().collect();
-    assert_eq!(received.len() as u64, SMALL_SAMPLES - seen.dropped);
-    for end in &seen.ends {
-        let counted = end.counted();
-        assert_eq!(end.wire.application_numbers(), received, "{}", end.name);
-        assert_eq!(counted.messages, received.len() as u64, "{}", end.name);
-        assert_eq!(counted.lost, seen.received.missing(), "{}", end.name);
-        assert_eq!(counted.bytes, counted.messages * 320, "{}", end.name);
-        assert_eq!(
-            (counted.recovered, counted.incomplete),
-            (0, 0),
-            "{}",
-            end.name
-        );
-        assert_eq!(counted.duplicates, end.wire.repeated, "{}", end.name);
-        end.assert_delays(&seen.received)?;
+    let streams = [0, 100, 200].map(|per_mille| lossy(Stream::small(SMALL_SAMPLES), per_mille));
+    for seen in Exchange::each(stack, &streams)? {
+        assert_eq!(seen.sent.sequences("pub").len() as u64, SMALL_SAMPLES);
+        let received: BTreeSet<u64> = seen.received.sequences("sub").into_iter().collect();
+        assert_eq!(received.len() as u64, SMALL_SAMPLES - seen.dropped);
+        for end in &seen.ends {
+            let counted = end.counted();
+            assert_eq!(end.wire.application_numbers(), received, "{}", end.name);
+            assert_eq!(counted.messages, received.len() as u64, "{}", end.name);
+            assert_eq!(counted.lost, seen.received.missing(), "{}", end.name);
+            assert_eq!(counted.bytes, counted.messages * 320, "{}", end.name);
+            assert_eq!(
+                (counted.recovered, counted.incomplete),
+                (0, 0),
+                "{}",
+                end.name
+            );
+            assert_eq!(counted.duplicates, end.wire.repeated, "{}", end.name);
+            end.assert_delays(&seen.received)?;
+        }
     }
     Ok(())
 }
 
-fn reliable(stack: Stack, per_mille: u16) -> Result<()> {
+/// Streams with 10 and with 20 % loss.
+fn reliable(stack: Stack) -> Result<()> {
     let _shared = MACHINE.read().unwrap_or_else(PoisonError::into_inner);
     let stream = Stream {
         reliable: true,
         depth: 1000,
         ..Stream::small(SMALL_SAMPLES)
     };
-    let seen = Exchange::of(stack, &stream, per_mille)?;
-    seen.print(stack, per_mille);
-    assert_eq!(seen.sent.sequences("pub").len() as u64, SMALL_SAMPLES);
-    let received: BTreeSet<u64> = seen.received.sequences("sub").into_iter().collect();
-    assert_eq!(received, (0..SMALL_SAMPLES).collect());
-    assert!(seen.dropped > 0);
-    for end in &seen.ends {
-        let counted = end.counted();
-        assert_eq!(end.wire.application_numbers(), received, "{}", end.name);
-        assert_eq!(counted.messages, SMALL_SAMPLES, "{}", end.name);
-        assert_eq!(counted.bytes, SMALL_SAMPLES * 320, "{}", end.name);
-        assert_eq!((counted.lost, counted.incomplete), (0, 0), "{}", end.name);
-        let recovered = end.wire.retransmitted..=end.wire.retransmitted + end.wire.announced_early;
-        assert!(recovered.contains(&counted.recovered), "{}", end.name);
-        assert!(
-            stack == Stack::Rust || end.wire.announced_early == 0,
-            "{}",
-            end.name
-        );
-        assert_eq!(counted.duplicates, end.wire.repeated, "{}", end.name);
+    let streams = [100, 200].map(|per_mille| lossy(stream.clone(), per_mille));
+    for seen in Exchange::each(stack, &streams)? {
+        assert_eq!(seen.sent.sequences("pub").len() as u64, SMALL_SAMPLES);
+        let received: BTreeSet<u64> = seen.received.sequences("sub").into_iter().collect();
+        assert_eq!(received, (0..SMALL_SAMPLES).collect());
+        assert!(seen.dropped > 0);
+        for end in &seen.ends {
+            let counted = end.counted();
+            assert_eq!(end.wire.application_numbers(), received, "{}", end.name);
+            assert_eq!(counted.messages, SMALL_SAMPLES, "{}", end.name);
+            assert_eq!(counted.bytes, SMALL_SAMPLES * 320, "{}", end.name);
+            assert_eq!((counted.lost, counted.incomplete), (0, 0), "{}", end.name);
+            let early = end.wire.announced_early;
+            let recovered = end.wire.retransmitted..=end.wire.retransmitted + early;
+            assert!(recovered.contains(&counted.recovered), "{}", end.name);
+            assert!(stack == Stack::Rust || early == 0, "{}", end.name);
+            assert_eq!(counted.duplicates, end.wire.repeated, "{}", end.name);
+        }
     }
     Ok(())
 }
 
+/// Returns a stream with this loss, on a topic of its own.
+fn lossy(stream: Stream, per_mille: u16) -> (Stream, u16) {
+    let topic = format!("{}_{per_mille}", stream.topic);
+    (Stream { topic, ..stream }, per_mille)
+}
+
 fn point_clouds(stack: Stack, size: usize) -> Result<()> {
     let _alone = MACHINE.write().unwrap_or_else(PoisonError::into_inner);
-    let seen = Exchange::of(stack, &Stream::point_cloud(size, POINT_CLOUDS), 0)?;
-    seen.print(stack, 0);
-    assert_eq!(seen.sent.sequences("pub").len() as u64, POINT_CLOUDS);
-    for end in &seen.ends {
-        let counted = end.counted();
-        let passed = end.wire.whole.len() as u64;
-        assert_eq!(counted.messages, passed, "{}", end.name);
-        assert_eq!(counted.lost, end.wire.missing(), "{}", end.name);
-        assert_eq!(counted.bytes, passed * size as u64, "{}", end.name);
-        assert_eq!(counted.recovered, 0, "{}", end.name);
-        // Every sample whose last datagram left the publisher was seen at least in part.
-        assert!(passed + counted.lost >= POINT_CLOUDS - 1, "{}", end.name);
-        // A sample is one record. Discovery and the stream's beginning are copied in addition, and
-        // the samples that are sent until the agent has read from a header which frame it names. A
-        // busy machine lets it wait for a sample or two.
-        let share = if size == 2_720_000 { 0.01 } else { 0.02 };
-        let copied = end.scrape.sum("ros2probe_capture_copied_bytes_total", &[]);
-        let traffic = counted.bytes as f64;
-        assert!(
-            copied < traffic * share + 3.0 * size as f64,
-            "{}: copied {copied} of {traffic} bytes",
-            end.name
-        );
-        end.assert_delays(&seen.received)?;
+    let stream = Stream::point_cloud(size, POINT_CLOUDS);
+    for seen in Exchange::each(stack, &[(stream, 0)])? {
+        assert_eq!(seen.sent.sequences("pub").len() as u64, POINT_CLOUDS);
+        for end in &seen.ends {
+            let counted = end.counted();
+            let passed = end.wire.whole.len() as u64;
+            assert_eq!(counted.messages, passed, "{}", end.name);
+            assert_eq!(counted.lost, end.wire.missing(), "{}", end.name);
+            assert_eq!(counted.bytes, passed * size as u64, "{}", end.name);
+            assert_eq!(counted.recovered, 0, "{}", end.name);
+            // Every sample whose last datagram left the publisher was seen at least in part.
+            assert!(passed + counted.lost >= POINT_CLOUDS - 1, "{}", end.name);
+            // A sample is one record. Discovery and the stream's beginning are copied in addition,
+            // and the samples that are sent until the agent has read from a header which frame it
+            // names. A busy machine lets it wait for a sample or two.
+            let share = if size == 2_720_000 { 0.01 } else { 0.02 };
+            let copied = end.scrape.sum("ros2probe_capture_copied_bytes_total", &[]);
+            let traffic = counted.bytes as f64;
+            assert!(
+                copied < traffic * share + 3.0 * size as f64,
+                "{}: copied {copied} of {traffic} bytes",
+                end.name
+            );
+            end.assert_delays(&seen.received)?;
+        }
     }
     Ok(())
 }
@@ -254,64 +217,29 @@ struct Counted {
 }
 
 impl Exchange {
-    fn of(stack: Stack, stream: &Stream, per_mille: u16) -> Result<Exchange> {
+    /// Sends the streams one after the other, each with its loss, under one observation.
+    fn each(stack: Stack, streams: &[(Stream, u16)]) -> Result<Vec<Exchange>> {
         let link = Link::new()?;
         let directory = tempfile::tempdir()?;
         let configuration = directory.path().join("ros2probe.yaml");
         std::fs::write(&configuration, format!("watch: [/**]\n{ON_THE_WIRE}"))?;
-        let robot = Observer::start("robot", &link.robot, &configuration)?;
-        let monitor = Observer::start("monitor", &link.monitor, &configuration)?;
-
-        let stream = Stream {
-            linger: 60.0,
-            ..stream.clone()
-        };
-        let (talker, listener) = (["/talker"], ["/listener"]);
-        let mut subscriber =
-            Peer::start(&link.monitor, stack, Role::Subscriber, &stream, &listener)?;
-        let mut publisher = Peer::start(&link.robot, stack, Role::Publisher, &stream, &talker)?;
-        subscriber.wait_matched()?;
-        publisher.wait_matched()?;
-        let loss = match per_mille {
-            0 => None,
-            _ => Some(Loss::of_samples(
-                &link.robot,
-                &link.monitor,
-                &stream,
-                per_mille,
-            )?),
-        };
-        // Until the agent has classified both endpoints, it reads no ACKNACKs, and samples that are
-        // repaired immediately count as reordered.
-        for observer in [&robot, &monitor] {
-            for endpoint in [publisher.guid()?, subscriber.guid()?] {
-                wait_metered(observer.agent.process.pid(), endpoint)?;
-            }
-        }
-        publisher.start_sending()?;
-        publisher
-            .wait_sent(Duration::from_secs(60))
-            .context("the publisher sends")?;
-        if stream.reliable {
-            wait_received(&subscriber, stream.count)?;
-        }
-        std::thread::sleep(capture::SETTLE);
-        let counts = loss.as_ref().map(Loss::counts).transpose()?;
-        publisher.process.terminate().context("the publisher")?;
-        // Once the writer is gone, all its losses have a cause.
-        let sent = publisher.log()?;
-        let writer = writer_of(&sent, &stream.topic)?;
-        let ends = [
-            robot.finish(stack, &stream.topic, &writer)?,
-            monitor.finish(stack, &stream.topic, &writer)?,
+        let observers = [
+            Observer::start("robot", &link.robot, &configuration)?,
+            Observer::start("monitor", &link.monitor, &configuration)?,
         ];
-        subscriber.process.terminate().context("the subscriber")?;
-        Ok(Exchange {
-            sent,
-            received: subscriber.log()?,
-            dropped: counts.map_or(0, |counts| counts.dropped),
-            ends,
-        })
+        let passages = streams
+            .iter()
+            .map(|(stream, per_mille)| Passage::of(stack, stream, *per_mille, &link, &observers));
+        let passages: Vec<Passage> = passages.collect::<Result<_>>()?;
+        let [robot, monitor] = observers;
+        let wires = [robot.finish()?, monitor.finish()?];
+        let mut all = Vec::new();
+        for (passage, (_, per_mille)) in passages.into_iter().zip(streams) {
+            let seen = passage.compared_with(&wires);
+            seen.print(stack, *per_mille);
+            all.push(seen);
+        }
+        Ok(all)
     }
 
     fn print(&self, stack: Stack, per_mille: u16) {
@@ -336,6 +264,99 @@ impl Exchange {
     }
 }
 
+/// A stream as its peers logged it and both agents counted it.
+struct Passage {
+    topic: String,
+    writer: String,
+    sent: EventLog,
+    received: EventLog,
+    dropped: u64,
+    scrapes: [(&'static str, Scrape); 2],
+}
+
+impl Passage {
+    fn of(
+        stack: Stack,
+        stream: &Stream,
+        per_mille: u16,
+        link: &Link,
+        observers: &[Observer<'_>; 2],
+    ) -> Result<Passage> {
+        let stream = Stream {
+            linger: 60.0,
+            ..stream.clone()
+        };
+        let (talker, listener) = (["/talker"], ["/listener"]);
+        let mut subscriber =
+            Peer::start(&link.monitor, stack, Role::Subscriber, &stream, &listener)?;
+        let mut publisher = Peer::start(&link.robot, stack, Role::Publisher, &stream, &talker)?;
+        subscriber.wait_matched()?;
+        publisher.wait_matched()?;
+        let loss = match per_mille {
+            0 => None,
+            _ => Some(Loss::of_samples(
+                &link.robot,
+                &link.monitor,
+                &stream,
+                per_mille,
+            )?),
+        };
+        // Until the agent has classified both endpoints, it reads no ACKNACKs, and samples that are
+        // repaired immediately count as reordered.
+        for observer in observers {
+            for endpoint in [publisher.guid()?, subscriber.guid()?] {
+                wait_metered(observer.agent.process.pid(), endpoint)?;
+            }
+        }
+        publisher.start_sending()?;
+        publisher
+            .wait_sent(Duration::from_secs(60))
+            .context("the publisher sends")?;
+        if stream.reliable {
+            wait_received(&subscriber, stream.count)?;
+        }
+        std::thread::sleep(capture::SETTLE);
+        let counts = loss.as_ref().map(Loss::counts).transpose()?;
+        publisher.process.terminate().context("the publisher")?;
+        // Once the writer is gone, all its losses have a cause.
+        let sent = publisher.log()?;
+        let writer = writer_of(&sent, &stream.topic)?;
+        let [robot, monitor] = observers;
+        let scrapes = [
+            (robot.name, robot.scrape_after(stack, &stream.topic)?),
+            (monitor.name, monitor.scrape_after(stack, &stream.topic)?),
+        ];
+        subscriber.process.terminate().context("the subscriber")?;
+        Ok(Passage {
+            topic: stream.topic,
+            writer,
+            sent,
+            received: subscriber.log()?,
+            dropped: counts.map_or(0, |counts| counts.dropped),
+            scrapes,
+        })
+    }
+
+    /// Returns the passage with its samples in the recordings of both ends.
+    fn compared_with(self, wires: &[Dissection; 2]) -> Exchange {
+        let [robot, monitor] = wires;
+        let [of_robot, of_monitor] = self.scrapes;
+        let ends = [(of_robot, robot), (of_monitor, monitor)];
+        let ends = ends.map(|((name, scrape), wire)| End {
+            name,
+            topic: self.topic.clone(),
+            wire: wire.samples_of(&self.writer),
+            scrape,
+        });
+        Exchange {
+            sent: self.sent,
+            received: self.received,
+            dropped: self.dropped,
+            ends,
+        }
+    }
+}
+
 /// An agent and a recording on one host.
 struct Observer<'a> {
     name: &'static str,
@@ -355,9 +376,9 @@ impl<'a> Observer<'a> {
         })
     }
 
-    /// Waits until the writer has left the agent's graph. On a busy machine, RustDDS may leave
-    /// without a goodbye; its samples are settled nevertheless.
-    fn finish(self, stack: Stack, topic: &str, writer: &str) -> Result<End> {
+    /// Returns the page after the writer has left the agent's graph. On a busy machine, RustDDS may
+    /// leave without a goodbye; its samples are settled nevertheless.
+    fn scrape_after(&self, stack: Stack, topic: &str) -> Result<Scrape> {
         let gone =
             |page: &Scrape| page.value("ros2_topic_publishers", &[("topic", topic)]) == Some(0.0);
         let mut scrape = self.agent.settled_scrape(topic, 0)?;
@@ -372,13 +393,12 @@ impl<'a> Observer<'a> {
             let dropped = scrape.sum(lossless, &[]);
             ensure!(dropped == 0.0, "{lossless} is {dropped} on {}", self.name);
         }
-        let recording = self.capture.finish()?;
-        Ok(End {
-            name: self.name,
-            topic: topic.to_owned(),
-            wire: Dissection::read(&recording)?.samples_of(writer),
-            scrape,
-        })
+        Ok(scrape)
+    }
+
+    /// Ends the recording, and reads it.
+    fn finish(self) -> Result<Dissection> {
+        Dissection::read(&self.capture.finish()?)
     }
 }
 
