@@ -2,7 +2,9 @@
 
 use std::collections::BTreeMap;
 use std::ffi::OsString;
+use std::io::{BufRead as _, BufReader};
 use std::path::Path;
+use std::process::Stdio;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context as _, Result, ensure};
@@ -11,7 +13,7 @@ use ros2probe_testing::harness::loss::Loss;
 use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::prometheus::{Kind, Prometheus};
-use ros2probe_testing::harness::wait_within;
+use ros2probe_testing::harness::{run, wait_within};
 use serde_json::json;
 
 use crate::browser::player::play;
@@ -20,6 +22,9 @@ use crate::browser::player::play;
 const PATIENCE: Duration = Duration::from_secs(90);
 /// Maximum gap between samples of each second, in seconds, on a busy machine.
 const GAP: f64 = 6.0;
+/// Robots in the summary of `make fleet`, and what it prints about the second one.
+const FLEET: [&str; 3] = ["robot-1 ", "robot-2  violated", "robot-3 "];
+const LOSES: &str = "  /points: max_loss_ratio is violated\n";
 /// A series that the agent always has.
 const UP: &str = "up{job=\"ros2probe\",instance=\"robot7\",site=\"hall 2\"}";
 
@@ -236,24 +241,34 @@ fn an_agent_answers_with_the_robots(centre: &Namespace, directory: &Path) -> Res
     Ok(())
 }
 
-/// `make fleet`: a robot that loses messages between its computers is the one in trouble.
+/// `make fleet`: a robot that loses messages between its computers is the one in trouble. The fleet
+/// ends once its summary shows that.
 #[test]
 fn the_fleet_of_make_fleet_shows_the_robot_that_loses_messages() -> Result<()> {
     let program = Path::new(env!("CARGO_BIN_EXE_rp")).with_file_name("examples/fleet");
-    let output = std::process::Command::new(program)
-        .args(["--seconds", "50"])
-        .output()?;
-    let text = String::from_utf8(output.stdout)?;
-    let errors = String::from_utf8(output.stderr)?;
-    ensure!(output.status.success(), "{errors}\n{text}");
+    let mut fleet = std::process::Command::new(program)
+        .args(["--seconds", "150"])
+        .stdout(Stdio::piped())
+        .spawn()?;
+    let output = fleet.stdout.take().context("no output")?;
+    let (mut text, mut is_ending) = (String::new(), false);
+    for line in BufReader::new(output).lines().map_while(Result::ok) {
+        text.push_str(&line);
+        text.push('\n');
+        let last = text.rsplit("\nROBOT ").next().unwrap_or_default();
+        let shows = |robot: &str| last.contains(&format!("\n{robot}"));
+        if !is_ending && last.contains(LOSES) && FLEET.iter().all(|robot| shows(robot)) {
+            is_ending = true;
+            run(&format!("kill -TERM {}", fleet.id()))?;
+        }
+    }
+    let status = fleet.wait()?;
+    ensure!(status.success(), "{status}\n{text}");
     let last = text.rsplit("\nROBOT ").next().unwrap_or_default();
-    for robot in ["robot-1 ", "robot-2  violated", "robot-3 "] {
+    for robot in FLEET {
         ensure!(last.contains(&format!("\n{robot}")), "{robot} in\n{last}");
     }
-    ensure!(
-        last.contains("  /points: max_loss_ratio is violated\n"),
-        "{last}"
-    );
+    ensure!(last.contains(LOSES), "{last}");
     for engine in [
         "Prometheus",
         "Alertmanager",
