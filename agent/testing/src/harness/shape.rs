@@ -1,8 +1,11 @@
 //! Publishers and subscribers of shapes on six implementations of DDS, with one command line and
 //! one log (see `agent/cli/tests/peers/shapes/README.md`).
 
+use std::collections::BTreeMap;
+use std::collections::btree_map::Entry;
 use std::path::PathBuf;
 use std::process::Command;
+use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use anyhow::{Context as _, Result};
@@ -78,18 +81,27 @@ impl Library {
         Ok((peer::built(&format!("shapes/{name}"))?, &[]))
     }
 
-    /// Returns whether it supports a capability in a role.
+    /// Returns whether it supports a capability in a role. Its program runs once for each role.
     pub fn can(self, role: Role, capability: &str) -> Result<bool> {
+        static KNOWN: Mutex<BTreeMap<(Library, &'static str), Value>> = Mutex::new(BTreeMap::new());
+        let mut known = KNOWN.lock().unwrap_or_else(PoisonError::into_inner);
+        let all = match known.entry((self, role.name())) {
+            Entry::Occupied(entry) => entry.into_mut(),
+            Entry::Vacant(entry) => entry.insert(self.capabilities(role)?),
+        };
+        let capability = all[capability].as_bool();
+        capability.with_context(|| format!("{self:?}: {all}"))
+    }
+
+    fn capabilities(self, role: Role) -> Result<Value> {
         let (program, words) = self.command()?;
         let mut command = Command::new(program);
         command
             .args(words)
             .args(["--capabilities", "--role", role.name()]);
         let output = command.output().context("cannot run a peer")?;
-        let all: Value = serde_json::from_slice(&output.stdout)
-            .with_context(|| format!("{command:?} printed no capabilities"))?;
-        let capability = all[capability].as_bool();
-        capability.with_context(|| format!("{command:?}: {all}"))
+        serde_json::from_slice(&output.stdout)
+            .with_context(|| format!("{command:?} printed no capabilities"))
     }
 }
 
