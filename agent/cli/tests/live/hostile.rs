@@ -367,7 +367,8 @@ fn check_real_topic(
         well_formed(&page);
         oldest = oldest.max(page.sum("ros2probe_snapshot_age_seconds", &[]));
         largest = largest.max(Usage::of(agent.process.pid())?.memory.unreclaimable);
-        std::thread::sleep(Duration::from_millis(300));
+        // The check of a page takes a tenth of a second of CPU.
+        std::thread::sleep(Duration::from_secs(1));
     }
     publisher.wait_sent(Duration::from_secs(60))?;
     let cpu = Usage::of(agent.process.pid())?.since(&before).cpu;

@@ -432,6 +432,7 @@ fn files_of_killed_nodes_are_a_finding_until_they_are_removed() -> Result<()> {
     let stream = Stream {
         // The segment of a participant holds two of its messages: 8 % of the directory each.
         size: 2_720_000,
+        rate: 10.0,
         ..shared()
     };
     let (mut publisher, mut subscriber) = host.pair(&stream)?;

@@ -55,7 +55,7 @@ fn all_loads_together_at_the_sockets_stay_within_the_limits_of_the_unit() -> Res
 fn everything(place: &str, capture: impl Fn(&Link) -> String) -> Result<()> {
     let seconds = std::env::var(SECONDS).ok();
     let seconds = seconds.map(|text| text.parse()).transpose()?;
-    let usual = if long().is_some() { 120 } else { 10 };
+    let usual = if long().is_some() { 120 } else { 5 };
     let span = Duration::from_secs(seconds.unwrap_or(usual));
     let mut allowance = Allowance::of_the_unit()?;
     if seconds.is_none() && long().is_none() {
@@ -176,7 +176,7 @@ struct PeakUsage {
     zenoh_aliases: f64,
 }
 
-/// Reads the values until everything is sent, and once more.
+/// Reads the values until everything is sent and the agent has refused some of it, and once more.
 fn observe(
     span: Duration,
     group: &UnitCgroups,
@@ -186,9 +186,10 @@ fn observe(
     let began = Instant::now();
     let mut peak = 0;
     let (mut participants, mut endpoints, mut zenoh_aliases) = (0.0_f64, 0.0_f64, 0.0_f64);
-    let mut is_sent = false;
+    let (mut is_sent, mut is_refused) = (false, false);
     while !is_sent {
-        is_sent = began.elapsed() >= span;
+        let longest = if is_refused { span } else { span + SENT };
+        is_sent = began.elapsed() >= longest;
         if is_sent {
             real.wait_sent()?;
         }
@@ -202,6 +203,7 @@ fn observe(
         participants = participants.max(table_usage(&page, "participants"));
         endpoints = endpoints.max(table_usage(&page, "endpoints"));
         zenoh_aliases = zenoh_aliases.max(filled_bytes(&page, "zenoh_aliases"));
+        is_refused = refusals_have_names(&page).is_ok();
         std::thread::sleep(Duration::from_millis(200));
     }
     Ok(PeakUsage {

@@ -74,7 +74,7 @@ fn all_caps_reached_together_stay_within_the_memory_of_the_unit() -> Result<()> 
     let idle = group.needed()?;
     let mut real = Counted::start(&link, 900_000, "real")?;
     real.send_samples(320, 50)?;
-    let span = Duration::from_secs(if long().is_some() { 120 } else { 8 });
+    let span = Duration::from_secs(if long().is_some() { 120 } else { 4 });
     let (sent, peak) = storm(&scene, &group, &link, span, 0.9)?;
     ensure!(peak < limit, "{peak} bytes with what sockets take");
     let took = scene.end()?;
