@@ -1,9 +1,9 @@
 // Offered and requested QoS of endpoints, side by side, with incompatible policies marked.
 
-import { count, duration, lastMessage, rate } from './format.js';
+import { bandwidth, count, duration, lastMessage, percent, rate } from './format.js';
 import { address } from './router.js';
 import { html, Mark, Name } from './ui.js';
-import { state, stream } from './store.js';
+import { state } from './store.js';
 
 /** Most endpoints side by side; those of incompatible pairs come first. */
 const MOST_COLUMNS = 8;
@@ -34,20 +34,21 @@ function Owner({ endpoint }) {
 export function Endpoints({ details, topic }) {
   const hasBuffers = [...details.publishers, ...details.subscriptions].some(
     (/** @type {any} */ each) => each.backends.length);
-  // The history has rates of topics, not of publishers.
-  const hasRates = stream.at == null;
   const latches = details.publishers.some((/** @type {any} */ each) => each.latched);
   const row = (/** @type {any} */ endpoint, /** @type {boolean} */ publishes) => {
     const own = (publishes ? topic.publishers : topic.subscriptions)
       .find((each) => each.guid === endpoint.guid);
     const participant = own && state.participants.get(own.participant);
+    const figures = endpoint.measurement ?? endpoint.past_figures;
     return html`<tr key=${endpoint.guid}><th scope="row"><${Owner} endpoint=${endpoint} /></th>
       <td><${Name} text=${[participant?.host, state.processName(participant),
         participant?.container].filter(Boolean).join(', ') || 'unknown'} /></td>
       <td>${endpoint.vendor ?? ''}</td>
       <td><${Name} text=${endpoint.message_type} /></td>
       ${hasBuffers && html`<td><${Name} text=${endpoint.backends.join(', ')} /></td>`}
-      ${publishes && hasRates && html`<td class="number">${rate(endpoint.measurement?.rate_hertz)}</td>`}
+      ${publishes && html`<td class="number">${rate(figures?.rate_hertz)}</td>
+      <td class="number">${bandwidth(figures?.bandwidth_bytes_per_second)}</td>
+      <td class="number">${percent(figures?.loss_ratio)}</td>`}
       ${publishes && latches && html`<td>${endpoint.latched && lastMessage(endpoint.latched)}</td>`}
       <td><${Name} text=${endpoint.guid} /></td></tr>`;
   };
@@ -58,12 +59,11 @@ export function Endpoints({ details, topic }) {
     <thead><tr><th scope="col">Node</th><th scope="col">Where</th>
       <th scope="col">Implementation</th><th scope="col">Type</th>
       ${hasBuffers && html`<th scope="col">Buffers in</th>`}
-      ${publishes && hasRates && html`<th scope="col" class="number">Rate</th>`}
+      ${publishes && html`<th scope="col" class="number">Rate</th>
+      <th scope="col" class="number">Bandwidth</th><th scope="col" class="number">Loss</th>`}
       ${publishes && latches && html`<th scope="col">Last message</th>`}
       <th scope="col">GUID</th></tr></thead>
-    <tbody>${list.map((endpoint) => row(endpoint, publishes))}</tbody></table></div>
-    ${publishes && !hasRates && html`<p class="dim">The history keeps the rate of the topic, and not that of each
-      publisher.</p>`}`;
+    <tbody>${list.map((endpoint) => row(endpoint, publishes))}</tbody></table></div>`;
   return html`<section aria-labelledby="endpoints"><h2 id="endpoints">Publishers and
     subscriptions</h2>
     ${details.publishers.length ? table(details.publishers, true)

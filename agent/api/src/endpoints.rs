@@ -55,6 +55,47 @@ pub struct Endpoint<'a> {
     /// The last message of this writer, if it is transient local and the agent keeps such messages;
     /// null for readers and for other writers.
     pub latched: Option<Latched>,
+    /// Figures of this writer at a moment in the past, as the history has them. Absent in the present,
+    /// for readers, and for topics that were not watched.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "openapi", schema(nullable = false))]
+    pub past_figures: Option<PastFigures>,
+}
+
+/// Figures of a writer at a moment in the past, rounded: a steady writer then changes nothing in the
+/// history.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+pub struct PastFigures {
+    /// Messages per second over the last window, with three digits; null if messages could not be
+    /// observed.
+    pub rate_hertz: Option<f64>,
+    /// Payload bytes per second over the same window, with two digits; null if the sizes were unknown.
+    pub bandwidth_bytes_per_second: Option<f64>,
+    /// Lost messages divided by the messages that were sent, with two digits; null before the first
+    /// message.
+    pub loss_ratio: Option<f64>,
+}
+
+impl PastFigures {
+    /// Returns the figures of a measurement that the history keeps.
+    #[must_use]
+    pub fn of(measured: &Measurement) -> Self {
+        let bandwidth = measured.bandwidth_bytes_per_second;
+        Self {
+            rate_hertz: measured.rate_hertz.map(|rate| rounded(rate, 3)),
+            bandwidth_bytes_per_second: bandwidth.map(|bandwidth| rounded(bandwidth, 2)),
+            loss_ratio: measured.loss_ratio.map(|ratio| rounded(ratio, 2)),
+        }
+    }
+}
+
+/// Returns the number with this many significant digits that is nearest to `value`.
+fn rounded(value: f64, digits: usize) -> f64 {
+    let after_first = digits.saturating_sub(1);
+    let text = format!("{value:.after_first$e}");
+    text.parse().unwrap_or(value)
 }
 
 /// The clock of the host of a writer. The agent corrects latencies by it.
@@ -117,4 +158,33 @@ pub struct Process<'a> {
     pub process: Option<Cow<'a, str>>,
     /// Path of the control group below the root; it identifies the container.
     pub cgroup: Option<Cow<'a, str>>,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn figures_of_the_past_have_few_digits() {
+        for (value, three, two) in [
+            (0.0, 0.0, 0.0),
+            (9.999_6, 10.0, 10.0),
+            (49.87, 49.9, 50.0),
+            (123_456.7, 123_000.0, 120_000.0),
+            (0.031_26, 0.031_3, 0.031),
+        ] {
+            let measured = Measurement {
+                rate_hertz: Some(value),
+                bandwidth_bytes_per_second: Some(value),
+                loss_ratio: None,
+                ..Measurement::default()
+            };
+            let expected = PastFigures {
+                rate_hertz: Some(three),
+                bandwidth_bytes_per_second: Some(two),
+                loss_ratio: None,
+            };
+            assert_eq!(PastFigures::of(&measured), expected);
+        }
+    }
 }

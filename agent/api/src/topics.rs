@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::Open;
 use crate::diagnosis::{Diagnosis, Finding};
-use crate::endpoints::Endpoint;
+use crate::endpoints::{Endpoint, PastFigures};
 use crate::inside::TopicInside;
 use crate::measurement::{Breakdown, Bucket, Delivered, Measurement};
 use crate::watches::Expectations;
@@ -106,16 +106,27 @@ pub struct TopicDetailsList<'a> {
     pub topics: Vec<TopicDetails<'a>>,
 }
 
+impl TopicDetailsList<'_> {
+    /// Removes the figures of all writers. Returns false if no writer had any.
+    pub fn remove_past_figures(&mut self) -> bool {
+        let topics = self.topics.iter_mut().map(|each| &mut each.topic);
+        let endpoints = topics.flat_map(|topic| topic.publishers.iter_mut());
+        let figures = endpoints.filter_map(|endpoint| endpoint.past_figures.take());
+        figures.count() > 0
+    }
+}
+
 impl TopicDetails<'_> {
     /// Returns the details without what changes with each message: measurements, histograms, and
-    /// acknowledgements of readers that do not lag.
+    /// acknowledgements of readers that do not lag. Of each writer, rounded figures stay.
     #[must_use]
     pub fn without_figures(mut self) -> Self {
         let topic = &mut self.topic;
         (topic.measurement, topic.received, topic.sent) = (None, None, None);
         topic.breakdown = None;
         for endpoint in topic.publishers.iter_mut().chain(&mut topic.subscriptions) {
-            endpoint.measurement = None;
+            let measured = endpoint.measurement.take();
+            endpoint.past_figures = measured.as_ref().map(PastFigures::of);
         }
         self.acknowledgements.retain(|each| each.lag_messages > 0);
         Self {

@@ -60,6 +60,7 @@ fn the_history_has_every_message_before_the_end_of_the_agent() -> Result<()> {
     ensure!(
         imu["publishers"][0]["qos"]["reliability"] == "BEST_EFFORT"
             && imu["measurement"].is_null()
+            && imu["publishers"][0]["past_figures"]["rate_hertz"].is_number()
             && imu["deliveries"][0]["delivered"]["messages"].as_u64() > Some(100),
         "{imu}"
     );

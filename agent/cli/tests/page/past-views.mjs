@@ -15,7 +15,7 @@ const viewsOf = (process) => [
   ['chains', /\/tf → \/parameter_events\s/, /\/tf → \/diagnostics\s/],
   ['agent', new RegExp(`Process\\s+${process.now}\\s[^]*Limits in use`), new RegExp(`Process\\s+${process.then}\\s[^]*Limits in use`)],
   ['topics/%2Fdiagnostics?domain=0', /Publishers \(2\)[^]*\/watchdog/,
-    /Publishers \(1\)[^]*\/monitor[^]*not that of each\s+publisher[^]*Reliability\s+BEST_EFFORT/],
+    /Publishers \(1\)[^]*Rate\s+Bandwidth\s+Loss[^]*\/monitor[^]*Reliability\s+BEST_EFFORT/],
   ['nodes/%2Fbase?domain=0', /Publishers \(2\)[^]*\/odom/, /Publishers \(1\)\s+\/tf/],
 ];
 

@@ -51,6 +51,7 @@ pub(super) fn endpoint<'a>(
         measurement: measured.map(|facts| measurement(facts, clock)),
         clock: None,
         latched: facts.latched.map(latched),
+        past_figures: None,
     }
 }
 

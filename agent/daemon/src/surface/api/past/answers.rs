@@ -107,7 +107,9 @@ fn answer(noun: KeptNoun, context: &Context, state: &State, room: usize) -> Opti
                 if json.is_some() || all.topics.is_empty() {
                     return json;
                 }
-                all.topics.truncate(all.topics.len() / 2);
+                if !all.remove_past_figures() {
+                    all.topics.truncate(all.topics.len() / 2);
+                }
             }
         }
     }

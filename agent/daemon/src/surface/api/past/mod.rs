@@ -157,8 +157,9 @@ async fn get_moment(
 /// the last one that was written before `at`: one a minute, and one every ten minutes in the part of
 /// the history without seconds. Topics have the form of `/topics/{topic}`, without measurements and
 /// histograms, and with the acknowledgements of readers that lag; those of services and discovery are
-/// left out. With `name` or `domain_id`, the list of topics or nodes has only those, or none.
-/// Parameters, diagnostics and logs need the same rights as in the present.
+/// left out. Each measured publisher has `past_figures`. With `name` or `domain_id`, the list of
+/// topics or nodes has only those, or none. Parameters, diagnostics and logs need the same rights as in
+/// the present.
 #[utoipa::path(
     get,
     path = "/history/moment/{noun}",

@@ -154,6 +154,36 @@ fn topics_of_services_take_no_room_of_the_others() {
     assert_eq!(names.collect::<Vec<_>>(), ["rt/imu", "raw"]);
 }
 
+/// Earlier, the past had the rate of a topic, and not that of each publisher.
+#[test]
+fn rates_of_publishers_are_kept_and_left_out_before_a_topic_is() {
+    let directory = tempfile::tempdir().unwrap();
+    let context = context(directory.path());
+    let agent = context.latest.state().agent.clone();
+    let snapshot = Some(Arc::new(sample_robot::snapshot(["/imu", "/scan"])));
+    let state = State { snapshot, agent };
+    let sizes = |room| -> usize {
+        let documents = answers::of_state(&context, &state, room);
+        documents.map(|document| document.content.len()).sum()
+    };
+    let kept = |room| -> serde_json::Value {
+        let mut documents = answers::of_state(&context, &state, room);
+        let topics = documents.find(|document| document.name == "topics");
+        serde_json::from_slice(&topics.unwrap().content).unwrap()
+    };
+    let all = kept(usize::MAX);
+    let scan = &all["topics"][1]["publishers"][0];
+    assert_eq!(scan["measurement"], serde_json::Value::Null);
+    let figures = serde_json::json!({
+        "rate_hertz": 20.0, "bandwidth_bytes_per_second": 13_000_000.0, "loss_ratio": 0.096,
+    });
+    assert_eq!(scan["past_figures"], figures);
+    let few = kept(sizes(usize::MAX) - 50);
+    assert_eq!(few["topics"].as_array().unwrap().len(), 2);
+    let scan = &few["topics"][1]["publishers"][0];
+    assert!(scan["node"] == "/lidar" && scan.get("past_figures").is_none());
+}
+
 #[tokio::test]
 async fn an_answer_of_the_past_is_found_after_a_restart_by_clients_with_its_rights() {
     let directory = tempfile::tempdir().unwrap();
