@@ -233,7 +233,8 @@ function Follow({ scope, name, topic, events }) {
       are not.</p>`}
     ${!message && !problem && !end && html`<p class="dim">${!topic.publishers.length
       ? 'Nobody publishes the topic now.' : !topic.subscriptions.length
-        ? 'Nobody subscribes, so nothing is sent.' : 'Waiting for a message …'}</p>`}
+        ? 'Nobody subscribes, so nothing is sent.' : stream.status === 'paused'
+          ? 'Paused: new messages are not shown.' : 'Waiting for a message …'}</p>`}
     ${plotted.length > 0 && html`<p><label><input type="checkbox" checked=${isRelative}
       onChange=${(/** @type {any} */ event) => setRelative(event.target.checked)} />
       Changes since the first value</label>${plotted.length > 1 && html` <label><input type="checkbox"

@@ -70,49 +70,68 @@ export function replaceAddress(to) {
   window.dispatchEvent(new HashChangeEvent('hashchange'));
 }
 
+/** @typedef {{path: string|null, part: string, data: any, problem: Refusal|null}} Answer */
+
+/**
+ * Returns an answer after a failed request: what was known stays, unless it needs another token now.
+ * @param {Answer} before
+ * @param {string} path
+ * @param {string} part
+ * @param {Refusal} problem
+ * @returns {Answer}
+ */
+export function afterProblem(before, path, part, problem) {
+  const isSame = before.path === path && before.part === part && !problem.needsToken;
+  return { path, part, problem, data: isSame ? before.data : null };
+}
+
+/** Whether a view may send a request: a paused page shows what it has. @param {boolean} isWanted */
+export function mayPoll(isWanted) {
+  return isWanted || stream.status !== 'paused';
+}
+
 /** Longest time until a request that was not sent, or failed, is due again. */
 const RETRY_MS = 10000;
 
 /**
  * Requests something while the tab is visible, and again if it changes with time. The answer stays
- * until the next one of the same path.
+ * until the next one of the same path, or until the right to it has ended.
  * @param {string|null} path null sends no request
  * @param {string} part what of the path is requested; after an error, no other part stays
  * @param {number} every milliseconds; 0 sends requests until one is answered
  * @param {(signal: AbortSignal) => Promise<any>} ask
- * @param {() => boolean} may whether requests make sense now
+ * @param {(isWanted: boolean) => boolean} may whether requests make sense now; `isWanted` if there is
+ *   no answer yet, or if the user asks for one
  * @returns {{data: any, problem: Refusal|null, refresh: () => void}}
  */
 export function useRequest(path, part, every, ask, may) {
-  const [answer, take] = useState(
-    /** @type {{path: string|null, part: string, data: any, problem: Refusal|null}} */
-    ({ path: null, part: '', data: null, problem: null }),
-  );
+  const [answer, take] = useState(/** @type {Answer} */ ({ path: null, part: '', data: null, problem: null }));
   const again = useRef(() => {});
   useEffect(() => {
     if (path == null) return undefined;
     const abort = new AbortController();
     let timer = 0;
-    const request = async () => {
+    let isKnown = false;
+    const request = async (isWanted = !isKnown) => {
       clearTimeout(timer);
       let wait = every > 0 ? Math.min(every, RETRY_MS) : RETRY_MS;
       let isAnswered = false;
-      if (document.visibilityState !== 'hidden' && may()) {
+      if (document.visibilityState !== 'hidden' && may(isWanted)) {
         try {
           take({ path, part, data: await ask(abort.signal), problem: null });
+          isKnown = true;
           wait = every;
           isAnswered = true;
         } catch (error) {
           if (abort.signal.aborted) return;
           const problem = error instanceof Refusal ? error : new Refusal(0, String(error));
           isAnswered = ![0, 503].includes(problem.status);
-          take((/** @type {any} */ before) => ({ path, part, problem,
-            data: before.path === path && before.part === part ? before.data : null }));
+          take((/** @type {Answer} */ before) => afterProblem(before, path, part, problem));
         }
       }
       if ((every > 0 || !isAnswered) && !abort.signal.aborted) timer = setTimeout(request, wait);
     };
-    again.current = request;
+    again.current = () => { request(true); };
     request();
     return () => {
       clearTimeout(timer);
@@ -138,8 +157,7 @@ export function usePoll(path, every) {
   const past = path != null && at != null ? pastOf(path, at) : null;
   const key = at == null ? path : past && `${path} at ${at}`;
   return useRequest(key, '', at == null ? every : 0, async (signal) =>
-    (past ? past.part(await json(past.path, { signal })) : json(String(path), { signal })),
-  () => stream.status !== 'paused');
+    (past ? past.part(await json(past.path, { signal })) : json(String(path), { signal })), mayPoll);
 }
 
 /**

@@ -82,7 +82,15 @@ export function useHistory(path, { span, at }, ask = json) {
   return useRequest(path, `${span} ${at}`, againAfter({ span, at }), (signal) => {
     const to = at ?? Math.floor(state.time);
     return ask(`${path}${path?.includes('?') ? '&' : '?'}from=${to - span}&to=${to}`, { signal });
-  }, () => at != null || stream.status === 'live');
+  }, (isWanted) => mayRead(at, isWanted));
+}
+
+/**
+ * Whether a part of the history may be requested. If it ends in the present, its time is that of the stream.
+ * @param {number|null} at @param {boolean} isWanted
+ */
+export function mayRead(at, isWanted) {
+  return at != null || stream.status === 'live' || (isWanted && stream.status === 'paused');
 }
 
 /** Requests lines of JSON. @param {string} path @param {RequestInit} options */
