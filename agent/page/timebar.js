@@ -106,14 +106,15 @@ export function useEvents(shown) {
 }
 
 /**
- * Returns the events of a time, and whether the oldest are missing. Without a history on disk, these are
- * the ones that the page knows.
+ * Returns the events of a time, whether the oldest are missing, and whether the history has answered.
+ * Without a history on disk, these are the ones that the page knows.
  * @param {Shown} shown
- * @returns {{events: import('./state.js').Event[], isTruncated: boolean}}
+ * @returns {{events: import('./state.js').Event[], isTruncated: boolean, isRead: boolean,
+ *   problem: import('./api.js').Refusal|null}}
  */
 export function useEventHistory(shown) {
   const isKept = state.open ? state.open.keeps_history : shown.at != null;
-  const { data } = useHistory(isKept ? 'history/events' : null, shown, lines);
+  const { data, problem } = useHistory(isKept ? 'history/events' : null, shown, lines);
   const to = shown.at ?? state.time;
   const all = new Map([...(data?.list ?? []), ...(shown.at == null ? state.events : [])]
     .map((event) => [event.id, event]));
@@ -121,7 +122,7 @@ export function useEventHistory(shown) {
     const time = Date.parse(event.time) / 1000;
     return time > to - shown.span && time <= to + 1;
   });
-  return { events, isTruncated: Boolean(data?.isTruncated) };
+  return { events, isTruncated: Boolean(data?.isTruncated), isRead: data != null, problem };
 }
 
 /**

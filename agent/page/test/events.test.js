@@ -4,7 +4,7 @@ import { test } from 'node:test';
 globalThis.document = /** @type {any} */ ({ addEventListener() {}, baseURI: 'http://x/' });
 globalThis.window = /** @type {any} */ ({ addEventListener() {} });
 globalThis.sessionStorage = /** @type {any} */ ({ getItem: () => null });
-const { attributesText, namesOf, parseEvents } = await import('../views/events.js');
+const { attributesText, namesOf, parseEvents, whyEmpty } = await import('../views/events.js');
 
 test('events of a stream that has ended, without comments and lags', () => {
   const text = ': ros2probe\nretry: 2000\nid: a-0\n\nevent: ros2.x\nid: a-1\ndata: {"id":"a-1"}\n\n'
@@ -37,4 +37,11 @@ test('departed endpoints and participants have the names that events carry', () 
   assert.deepEqual(['aa.1c1', 'aa.103', 'bb.103', 'bb.203', 'cc.103', 'dd.1c1', 'ee.103', 'ff.103', 'text'].map(nameOf),
     ['/lidar', '/lidar', '/b', 'participant of /a and others', 'writer of /points', 'rviz2 on desk', '/now',
       undefined, undefined]);
+});
+
+test('a time without events is not one that is being read, or whose events are filtered', () => {
+  assert.equal(whyEmpty(true, false, 0), 'Reading the history …');
+  assert.equal(whyEmpty(true, true, 0), 'No event in this time.');
+  assert.equal(whyEmpty(true, true, 3), 'No event matches.');
+  assert.equal(whyEmpty(false, false, 0), 'No event yet.');
 });

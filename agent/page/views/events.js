@@ -6,7 +6,7 @@ import { count, date, eventWords, several, visible, when } from '../format.js';
 import { address } from '../router.js';
 import { replaceAddress, state, useLive } from '../store.js';
 import { inWords, useEventHistory, useTime } from '../timebar.js';
-import { Filter, html, Mark, matches, Name } from '../ui.js';
+import { Failed, Filter, html, Mark, matches, Name } from '../ui.js';
 
 /** Most events in the document; the filter finds older ones. */
 const MOST_SHOWN = 300;
@@ -125,6 +125,18 @@ export function useEarlier() {
   return failed;
 }
 
+/**
+ * Returns why a list of events is empty.
+ * @param {boolean} isPast whether they are those of a time
+ * @param {boolean} isRead whether the events of that time are known
+ * @param {number} number of events before they were filtered
+ */
+export function whyEmpty(isPast, isRead, number) {
+  if (number) return 'No event matches.';
+  if (!isPast) return 'No event yet.';
+  return isRead ? 'No event in this time.' : 'Reading the history …';
+}
+
 /** @param {{query: Record<string, string>}} props */
 export function Events({ query }) {
   useLive();
@@ -134,11 +146,12 @@ export function Events({ query }) {
   const change = (/** @type {Record<string, any>} */ more) => replaceAddress(
     address('events', null, { ...query, ...more }));
   const shown = useTime();
-  const { events: past, isTruncated } = useEventHistory(shown);
+  const { events: past, isTruncated, isRead, problem } = useEventHistory(shown);
   const isPast = shown.at != null || (query.span != null && state.open?.keeps_history);
   // Events before the shown ones name what they mention.
   const names = namesOf([...past, ...state.events], ownersNow());
-  const rows = (isPast ? past : held ?? state.events).filter((/** @type {any} */ event) =>
+  const all = isPast ? past : held ?? state.events;
+  const rows = all.filter((/** @type {any} */ event) =>
     (severity || filter || !ROUTINE.test(event.name))
     && (!severity || severity === 'ALL' || event.severity === severity || (severity === 'WARN' && event.severity === 'ERROR'))
     && (!filter || matches(filter, `${event.name} ${eventWords(event)} ${attributesText(event.attributes)} ${
@@ -157,7 +170,8 @@ export function Events({ query }) {
       ${!isPast && html`<button type="button" aria-pressed=${held != null}
         onClick=${() => hold(held ? null : [...state.events])}>${held
           ? `Continue${fresh > 0 ? ` (${several(fresh, 'new event')})` : ''}` : 'Pause'}</button>`}</div>
-    ${failed && html`<p class="problem"><${Mark} severity="warning" /> No earlier events: ${failed}</p>`}
+    ${isPast ? html`<${Failed} problem=${problem} what="No events" />`
+      : failed && html`<p class="problem"><${Mark} severity="warning" /> No earlier events: ${failed}</p>`}
     ${isPast && isTruncated && html`<p class="problem"><${Mark} severity="warning" /> The oldest events of
       this time are too many for one answer. A shorter time has them.</p>`}
     ${state.missedEvents > 0 && html`<p class="dim">${count(state.missedEvents)} events were
@@ -171,7 +185,7 @@ export function Events({ query }) {
         <td><${Attributes} event=${event} names=${names} /></td></tr>`)}</tbody></table></div>
       ${rows.length > MOST_SHOWN && html`<p class="dim">The latest ${count(MOST_SHOWN)} of ${count(
         rows.length)}.</p>`}`
-      : html`<p class="empty">${state.events.length ? 'No event matches.' : 'No event yet.'}</p>`}`;
+      : !(isPast && problem) && html`<p class="empty">${whyEmpty(isPast, isRead, all.length)}</p>`}`;
 }
 
 /** @param {{event: import('../state.js').Event, names: (guid: string) => string|undefined}} props */
