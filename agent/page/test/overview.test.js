@@ -4,7 +4,7 @@ import { test } from 'node:test';
 globalThis.document = /** @type {any} */ ({ addEventListener() {}, baseURI: 'http://x/' });
 globalThis.window = /** @type {any} */ ({ addEventListener() {} });
 globalThis.location = /** @type {any} */ ({ hash: '' });
-const { Findings, grouped, Incomplete } = await import('../views/overview.js');
+const { Findings, grouped, Incomplete, Totals } = await import('../views/overview.js');
 const { state } = await import('../store.js');
 const { Badges, FLAG_MEANINGS, FLAGS, Meanings } = await import('../ui.js');
 
@@ -56,4 +56,17 @@ test('every state of a topic is explained where keys and touch reach it', () => 
     assert.ok(meaning && below.includes(meaning), flag);
     assert.ok(JSON.stringify(Badges({ flags: [flag], explained: true })).includes(meaning), flag);
   }
+});
+
+test('figures of a moment in the past are not called those of now', () => {
+  state.apply({ open: { run: 'r', flags: [], passages: [], access: 'read' } });
+  state.apply({ graph: { participants: [], nodes: [], publishers: [], subscriptions: [],
+    topics: [[1, 0, '/scan', 'rt/scan', 'topic', ['T'], 0, 0, 1, 3]] } });
+  state.apply({ values: { t: 1, totals: [0, 0, 0, 1], topics: [[1, 84, 1, 100, 0, 0, null, null, 0, 1, 100]] } });
+  const shown = () => JSON.stringify([Totals(), Findings({ list: [/** @type {any} */ ({ id: 'v', kind: 'watch_violated',
+    severity: 'warning', topic: 1, node: null, since: null, text: 'at least 85 Hz', remedy: null })] })]);
+  assert.match(shown(), /"Now".*\(now 84 Hz\)/);
+  state.past = true;
+  assert.match(shown(), /"At that time".*\(then 84 Hz\)/);
+  state.past = false;
 });

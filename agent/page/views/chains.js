@@ -285,8 +285,8 @@ export function ChainField({ chains, chain, query, change }) {
         only this chain</label>
       <a href=${chainAddress(chain)}>Open the chain</a>`}
     ${query.chain && !chain && chains.data && html`<span class="problem"><${Mark}
-      severity="warning" /> The chain from <${Name} text=${query.chain} most=${40} /> does not exist
-      now.</span>`}</div>`;
+      severity="warning" /> The chain from <${Name} text=${query.chain} most=${40} /> does not exist${' '}
+      ${state.past ? 'at that time' : 'now'}.</span>`}</div>`;
 }
 
 /** @param {import('../chains.js').Chain} chain */

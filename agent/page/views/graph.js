@@ -370,7 +370,7 @@ export function Graph({ query }) {
     <${Failed} problem=${asked.problem} what="No services and actions" />
     ${failed && html`<p class="problem">${failed}</p>`}
     ${!graph.vertices.length && html`<p class="empty">${focus
-      ? 'The selected node or topic does not exist now.' : 'No node is known.'}</p><${Incomplete} missing="the graph lacks them" />`}
+      ? `The selected node or topic does not exist ${state.past ? 'at that time' : 'now'}.` : 'No node is known.'}</p><${Incomplete} missing="the graph lacks them" />`}
     ${graph.vertices.length > 0 && html`<${Scale} tint=${tint} colours=${colours} />`}
     ${picture && graph.vertices.length > 0 && html`<div class="graph ${isPicked
       ? 'beside' : ''}">

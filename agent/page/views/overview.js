@@ -83,7 +83,7 @@ export function grouped(list) {
   return [firsts, more];
 }
 
-/** Returns the present figures beside what is expected. @param {import('../state.js').Finding} finding */
+/** Returns the figures of the shown time beside what is expected. @param {import('../state.js').Finding} finding */
 function now(finding) {
   if (finding.topic == null) return '';
   const figures = state.figuresOf(finding.topic);
@@ -94,7 +94,7 @@ function now(finding) {
   if (finding.kind === 'watch_violated' && figures.rate != null) {
     const latency = /latency/.test(finding.text) && figures.p99 != null
       ? `, latency p99 ${duration(figures.p99)}` : '';
-    return ` (now ${rate(figures.rate)}${latency})`;
+    return ` (${state.past ? 'then' : 'now'} ${rate(figures.rate)}${latency})`;
   }
   return '';
 }
@@ -121,13 +121,13 @@ function Place({ finding }) {
   return html`<a href=${href}><${Name} text=${title} /></a>:`;
 }
 
-function Totals() {
+export function Totals() {
   const { rate: messages, bandwidth: bytes, lost, measured } = state.totals;
   const [rates, sizes, losses] = state.totalSeries.map((series) => series.points);
   const shown = [...state.topics.values()].filter((topic) => !topic.hidden && !topic.vanished);
   const nodes = [...state.nodes.values()].filter((node) => !node.hidden);
   const unknown = state.agent?.unknown_writers ?? 0;
-  return html`<section aria-labelledby="totals"><h2 id="totals">Now</h2><div class="figures">
+  return html`<section aria-labelledby="totals"><h2 id="totals">${state.past ? 'At that time' : 'Now'}</h2><div class="figures">
     <${Figure} label="messages a second" value=${rate(messages).replace('Hz', '/s')} points=${rates} />
     <${Figure} label="bytes a second" value=${bandwidth(bytes)} points=${sizes} />
     <${Figure} label="lost a second" value=${count(lost)} points=${losses} />
