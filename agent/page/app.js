@@ -7,7 +7,7 @@ import { count, date, visible } from './format.js';
 import { address, parse, tokenOf } from './router.js';
 import { Keys, Search, Token } from './dialogs.js';
 import { kept, keep, state, stream, useLive, useRoute, useScripts } from './store.js';
-import { html, Mark } from './ui.js';
+import { AskButton, html, Mark } from './ui.js';
 import { PresentOnly, TimeBar } from './timebar.js';
 import { Agent } from './views/agent.js';
 import { Doctor } from './views/doctor.js';
@@ -116,7 +116,8 @@ function App() {
     <main id="main" tabindex="-1" ref=${main}>
       ${state.batches > 0 || route?.view === 'token'
         ? html`<${View} key=${place} route=${route} />`
-        : html`<h1 tabindex="-1">${refused ? 'The agent requires a token' : 'Connecting …'}</h1>`}
+        : html`<h1 tabindex="-1">${refused ? 'The agent requires a token' : 'Connecting …'}</h1>${refused
+          && html`<p><${AskButton} /></p>`}`}
     </main>
     <${News} />
     ${dialog === 'search' && html`<${Search} close=${() => show(null)} />`}
@@ -253,6 +254,10 @@ function Notice() {
     const why = stream.problem?.message ?? 'the connection was lost';
     return html`<p class="notice" role="status"><${Mark} severity="warning" /> No connection: ${why}.
       ${state.batches > 0 ? ' The figures below are the last ones.' : ''} Trying again.</p>`;
+  }
+  if (stream.status === 'refused' && state.batches > 0) {
+    return html`<p class="notice" role="status"><${Mark} severity="warning" /> The agent requires a token:${' '}
+      ${stream.problem?.message}.${state.past ? '' : ' The figures below are the last ones.'} <${AskButton} /></p>`;
   }
   if (stream.status === 'paused') {
     return html`<p class="notice" role="status">Paused: the figures below are not updated.${' '}

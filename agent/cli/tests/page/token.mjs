@@ -82,6 +82,10 @@ async function strict(open) {
   await tab.page.getByRole('dialog', { name: 'Token' }).waitFor();
   await tab.shows('This address requires a token.', 'dialog');
   await tab.accessible('login');
+  // A closed dialog opens again.
+  await tab.page.keyboard.press('Escape');
+  await gone(tab.page.getByRole('dialog', { name: 'Token' }));
+  await tab.page.getByRole('button', { name: 'Enter a token' }).click();
   await tab.page.getByLabel('Token', { exact: true }).last().fill('not the right one');
   await tab.page.getByRole('button', { name: 'Use this token' }).click();
   await until('refused again', async () => (await tab.text('body')).includes('refused'));
