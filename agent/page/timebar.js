@@ -151,7 +151,8 @@ export function TimeBar() {
   const shown = useTime();
   const { span, at } = shown;
   useEffect(() => stream.go(at), [at]);
-  if (state.open?.replay) return html`<${Replay} />`;
+  // A replay has no history: the address of a moment in the past came from another agent.
+  if (state.open?.replay && at == null) return html`<${Replay} />`;
   if (!state.open?.keeps_history && at == null) return null;
   const known = SPANS.some(([seconds]) => seconds === span);
   const end = at ?? state.time;

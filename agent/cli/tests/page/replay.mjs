@@ -44,4 +44,12 @@ await scenario(async (open) => {
   await button('Play').click();
   await reads(bar, /finished/);
   await tab.live();
+
+  // The address of a moment in the past has a way back.
+  tab.expect(/^error: Failed to load resource.*404/);
+  await tab.page.goto(`${tab.address}#/?at=1000000`);
+  await reads(tab.page.locator('.notice'), 'The robot’s state at that time is unknown');
+  await tab.page.getByRole('button', { name: 'Now' }).click();
+  await tab.live();
+  await reads(bar, /finished/);
 });
