@@ -1,6 +1,6 @@
 // Small pictures of messages: images, maps, scans, point clouds and poses.
 
-import { useEffect, useRef } from './vendor/hooks.mjs';
+import { useEffect, useRef, useState } from './vendor/hooks.mjs';
 import { count } from './format.js';
 import { colour, html } from './ui.js';
 
@@ -132,11 +132,14 @@ export function Preview({ preview, error }) {
   const passed = useRef(/** @type {number[][]} */ ([]));
   const points = preview?.points ? pointsOf(preview.points.xyz) : null;
   const poses = preview?.poses;
+  const [isBroken, fail] = useState(false);
   useEffect(() => {
     const own = canvas.current;
     if (!own || !preview) return;
     if (preview.picture) drawPicture(own, preview.picture);
-    if (preview.encoded) drawEncoded(own, preview.encoded.data).catch(() => {});
+    if (preview.encoded) {
+      drawEncoded(own, preview.encoded.data).then(() => fail(false), () => fail(true));
+    }
     if (points) drawPoints(own, points);
     if (!poses) return;
     if (poses.length === 1) {
@@ -155,5 +158,6 @@ export function Preview({ preview, error }) {
         widthOf(fromAbove([...points, [0, 0, 0]]).metres)} m wide; colours are heights`
         : `${count(poses.length)} ${poses.length === 1 ? 'pose, and the way to it' : 'poses'} from above`;
   return html`<figure class="preview"><canvas ref=${canvas} role="img" aria-label="Preview: ${words}" />
-    <figcaption class="dim">${words}</figcaption></figure>`;
+    <figcaption class="dim">${words}${encoded && isBroken
+      ? ', which this browser cannot draw' : ''}</figcaption></figure>`;
 }

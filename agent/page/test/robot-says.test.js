@@ -4,7 +4,7 @@ import { test } from 'node:test';
 globalThis.document = /** @type {any} */ ({ addEventListener() {}, baseURI: 'http://x/' });
 globalThis.window = /** @type {any} */ ({ addEventListener() {} });
 globalThis.location = /** @type {any} */ ({ hash: '' });
-const { changesOf, extrapolation, jumpsOf, jumpWords, linesOf, Minutes, partsOf, Rates, stampAge } = await import('../views/robot.js');
+const { changesOf, extrapolation, isHeard, jumpsOf, jumpWords, linesOf, Minutes, partsOf, Rates, stampAge } = await import('../views/robot.js');
 
 const status = (/** @type {string} */ name, /** @type {string} */ level, topic = '/diagnostics') =>
   ({ domain_id: 0, topic, name, level, hardware_id: '', message: '', values: [] });
@@ -96,4 +96,10 @@ test('rates are averages of the last half minute', () => {
   for (let time = 104; time <= 140; time += 2) take(time, 9);
   assert.equal(rates.of('0 /s'), 0);
   assert.equal(rates.of('0 /other'), null);
+});
+
+test('logs of other levels than the chosen one are not no logs', () => {
+  const node = (/** @type {number[]} */ ...numbers) => ({ levels: numbers.map((messages) => ({ messages })) });
+  assert.ok(isHeard([node(0), node(0, 3)]));
+  assert.ok(!isHeard([node(0), node()]));
 });

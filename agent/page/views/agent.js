@@ -1,6 +1,6 @@
 // The agent itself: its source, its abilities, the use of limits, and its drops.
 
-import { bytes, count, duration, percent } from '../format.js';
+import { bytes, count, duration, percent, several } from '../format.js';
 import { address } from '../router.js';
 import { state, stream, useLive, usePoll } from '../store.js';
 import { AskButton, Failed, html, Mark, Name } from '../ui.js';
@@ -49,12 +49,12 @@ export function Agent() {
         && html`<${AskButton} />`}`]] : []),
       ['Running for', duration(data?.uptime_seconds)],
       ['Process', data?.process_id ?? '–'],
-      ['Capabilities', html`<${Name} text=${data?.capabilities.join(', ') || 'none'} />`],
+      ['Capabilities', html`<${Name} text=${data ? data.capabilities.join(', ') || 'none' : '–'} />`],
       ['Watches', html`${count(data?.watches)} <a href=${address('topics', null,
         { only: 'measured' })}>measured topics</a>`],
       ...(stream.at == null ? [['Stream', stream.status]] : []),
-      ...(data?.zenoh ? [['Zenoh', `${count(data.zenoh.connections)} connections, ${
-        count(data.zenoh.routers)} routers`]] : []),
+      ...(data?.zenoh ? [['Zenoh', `${several(data.zenoh.connections, 'connection')}, ${
+        several(data.zenoh.routers, 'router')}`]] : []),
     ]} />
     ${data && html`
     <section aria-labelledby="abilities"><h2 id="abilities">Abilities</h2><table class="short"

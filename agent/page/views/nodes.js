@@ -205,12 +205,12 @@ function Links() {
  */
 function ProcessCharts({ participants }) {
   const shown = useTime();
-  const { data } = useHistory(state.open?.keeps_history ? 'history/processes' : null, shown);
+  const { data, problem } = useHistory(state.open?.keeps_history ? 'history/processes' : null, shown);
   const own = usageOf(data?.processes ?? [], participants);
   const title = inWords(shown);
   const events = useEvents(shown).filter(({ severity }) => severity !== 'INFO');
   const marks = marksOf(events);
-  return html`${data?.is_truncated && !own.length && html`<p class="problem"><${Mark} severity="warning" /> Processes that
+  return html`<${Failed} problem=${problem} what="No CPU and memory over time" />${data?.is_truncated && !own.length && html`<p class="problem"><${Mark} severity="warning" /> Processes that
     ended early in this time are too many for one answer. A shorter time has them.</p>`}${own.map((/** @type {any} */ each) => html`<section key=${`${each.process_id} ${each.process}`}
     aria-label="CPU and memory of ${each.process}"><h2>${title}: <${Name}
       text=${`${each.process} ${each.process_id}`} /></h2><div class="charts">

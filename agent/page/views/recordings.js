@@ -91,7 +91,7 @@ function Write({ name, again }) {
   const [written, setWritten] = useState('');
   return html`<${Act} label="Write now: snapshot ${name}" action=${async () => {
     const answer = await post(`snapshots/${encodeURIComponent(name)}`);
-    setWritten(`${count(answer.messages)} messages in ${answer.directory}`);
+    setWritten(`${several(answer.messages, 'message')} in ${answer.directory}`);
     again();
   }}>Write now</${Act}> <span role="status"><${Name} text=${written} /></span>`;
 }

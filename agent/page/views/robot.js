@@ -145,6 +145,11 @@ function LogChart({ answer }) {
       since == null ? '' : `, known since ${clock(since)}`}`} />`;
 }
 
+/** Returns whether any message of logs is known: one of another level may be. @param {any[]} nodes */
+export function isHeard(nodes) {
+  return nodes.some(({ levels }) => levels.some((/** @type {any} */ each) => each.messages > 0));
+}
+
 /** @param {Props} props */
 function Logs({ query, change }) {
   const { filter = '', level = '' } = query;
@@ -176,7 +181,7 @@ function Logs({ query, change }) {
         </tr>`)}</tbody></table></div>
       ${rows.length >= MOST_SHOWN && html`<p class="dim">The latest ${count(MOST_SHOWN)}${filter
         ? ` of ${count(rows.length)}` : `; a filter searches the latest ${count(MOST_KEPT)}`}.</p>`}`
-    : all.length ? html`<p class="empty">No message matches.</p>`
+    : all.length || isHeard(nodes) ? html`<p class="empty">No message matches.</p>`
       : html`<${Nothing} answer=${answer} part="logs">No message of <code>/rosout</code> so far. A
         message that no subscription requests is not sent.</${Nothing}>`}
     ${nodes.length > 0 && html`<section aria-labelledby="by-node"><h2 id="by-node">By node</h2>
@@ -558,6 +563,9 @@ function Services({ query, change }) {
   return html`<div class="controls"><${Filter} label="Filter" value=${filter}
       found=${rows.length + goals.length} noun="name"
       change=${(/** @type {string} */ text) => change({ filter: text })} /></div>
+    <${Failed} problem=${actions.problem} what=${actions.data ? 'The actions are not updated' : 'No actions'} />
+    ${(rows.length > 0 || goals.length > 0) && html`<${Failed} problem=${services.problem}
+      what=${services.data ? 'The services are not updated' : 'No services'} />`}
     ${goals.length > 0 && html`<section aria-labelledby="actions"><h2 id="actions">Actions</h2>
       <div class="scroll" tabindex="0" role="group" aria-labelledby="actions"><table>
       <thead><tr><th scope="col">Action</th><th scope="col">Server</th>${results.map((each) => html`

@@ -240,7 +240,7 @@ function Waterfall({ details }) {
       sum + each.delivered.messages, 0);
     return html`<section aria-labelledby="waterfall">${title}
       <p class="dim">${sent.length
-        ? `${count(out)} messages left this host; what arrives elsewhere is seen there.`
+        ? `${several(out, 'message')} left this host; what arrives elsewhere is seen there.`
         : 'No delivery to a subscriber’s socket has been seen yet.'}</p></section>`;
   }
   // Only TCP shows what a sender drops.
