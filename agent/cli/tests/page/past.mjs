@@ -63,8 +63,8 @@ await scenario(async (open) => {
   // The QoS of a topic that no longer exists, CPU and services of a node, and a view without a past.
   await page.goto(`${page.url().split('#')[0]}#/topics/%2Fimu?at=${end}&span=${end - begin}`);
   await reads(page.locator('main'), /Quality of service[^]*offered by[^]*Reliability/);
-  // The rate of its publisher, in its row.
-  await reads(page.getByRole('group', { name: 'Publishers' }), /\/lidar\s[^]*\d Hz\s/);
+  // The rate of its publisher.
+  await reads(page.getByRole('group', { name: 'Publishers' }), /Rate[^]*\d Hz\s/);
   await reads(page.locator('main'), /Where messages are lost[^]*Delivered/);
   await tab.accessible('the QoS of the past');
   await page.goto(`${page.url().split('#')[0]}#/nodes?at=${end}&span=${end - begin}`);
