@@ -6,6 +6,9 @@
 //! reply is untrusted. Types that a `.msg` file cannot define are refused by name.
 
 mod assembly;
+mod padding;
+
+use std::borrow::Cow;
 
 use md5::{Digest as _, Md5};
 use ros2probe_wire::cursor::{Cursor, Endianness, WireError};
@@ -29,6 +32,8 @@ const MAX_DIMENSIONS: u32 = 8;
 const MAX_NAME: usize = 256;
 /// Length of the request's identity in a reply, in bytes.
 const REQUEST_IDENTITY: usize = 24;
+/// Length of an `EquivalenceHash`, in bytes.
+const EQUIVALENCE_HASH: usize = size_of::<EquivalenceHash>();
 /// Discriminator of a TypeIdentifier or TypeObject of a minimal and of a complete type.
 const EK_MINIMAL: u8 = 0xf1;
 const EK_COMPLETE: u8 = 0xf2;
@@ -132,12 +137,12 @@ pub(crate) fn without_request(payload: &[u8]) -> &[u8] {
 /// Returns the hashes and the bytes of the complete types in a reply. The payload begins with its
 /// encapsulation header. A reply to another request, or with a failure, has none.
 ///
-/// Objects that do not have their hash are left out, because Fast DDS 3.2 leaves bytes between the
-/// fields of some undefined.
+/// Objects that do not have their hash are left out. Their padding does not count: Fast DDS 3
+/// leaves it undefined, and the returned bytes have zeros instead.
 ///
 /// # Errors
 /// Fails if the payload is not a reply, or if no object has its hash.
-pub(crate) fn objects(payload: &[u8]) -> Result<Vec<(EquivalenceHash, &[u8])>, NotUsable> {
+pub(crate) fn objects(payload: &[u8]) -> Result<Vec<(EquivalenceHash, Cow<'_, [u8]>)>, NotUsable> {
     if payload.len() > MAX_REPLY {
         return Err(NotUsable::TooLong);
     }
@@ -186,9 +191,9 @@ pub(crate) fn objects(payload: &[u8]) -> Result<Vec<(EquivalenceHash, &[u8])>, N
         let object = delimited(&mut pairs, "type_object")?;
         let bytes = bytes.get(..4 + object.remaining()).unwrap_or_default();
         if kind == EK_COMPLETE {
-            match Md5::digest(bytes).starts_with(&hash.0) {
-                true => found.push((hash, bytes)),
-                false => forged = Some(hash),
+            match with_hash(bytes, hash) {
+                Some(object) => found.push((hash, object)),
+                None => forged = Some(hash),
             }
         }
     }
@@ -196,6 +201,16 @@ pub(crate) fn objects(payload: &[u8]) -> Result<Vec<(EquivalenceHash, &[u8])>, N
         Some(hash) if found.is_empty() => Err(NotUsable::Forged(hash)),
         _ => Ok(found),
     }
+}
+
+/// Returns the object if it has the hash with zeros as padding; `None` if it is another object.
+fn with_hash(bytes: &[u8], hash: EquivalenceHash) -> Option<Cow<'_, [u8]>> {
+    let has_hash = |bytes: &[u8]| Md5::digest(bytes).starts_with(&hash.0);
+    if has_hash(bytes) {
+        return Some(Cow::Borrowed(bytes));
+    }
+    let zeroed = padding::zeroed(bytes)?;
+    has_hash(&zeroed).then_some(Cow::Owned(zeroed))
 }
 
 impl TypeObject {

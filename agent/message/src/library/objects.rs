@@ -51,7 +51,7 @@ impl Objects {
             return;
         };
         for (hash, bytes) in objects {
-            let parsed = TypeObject::parse(bytes);
+            let parsed = TypeObject::parse(&bytes);
             let size = parsed
                 .as_ref()
                 .map_or(size_of::<Object>(), TypeObject::size);

@@ -49,7 +49,7 @@ fn assembled(replies: &[&[u8]]) -> Result<MessageType, NotUsable> {
     let mut all = Vec::new();
     for reply in replies {
         for (hash, bytes) in objects(reply)? {
-            all.push((hash, TypeObject::parse(bytes)));
+            all.push((hash, TypeObject::parse(&bytes)));
         }
     }
     message_type(all[0].0, |wanted| {
@@ -182,6 +182,46 @@ fn every_changed_byte_of_an_object_is_noticed() {
             assert!(read.iter().all(|pair| all.contains(pair)), "{length}");
         }
     }
+}
+
+/// The padding in replies, from the layout of DDS-XTypes 1.3, 7.3.4.
+const THING_PADDING: [usize; 14] = [
+    0x5f, 0x85, 0x86, 0x87, 0xb3, 0xbd, 0xbe, 0xbf, 0xde, 0xdf, 0xfa, 0xfb, 0x102, 0x103,
+];
+const TICKS_PADDING: [usize; 7] = [0x5e, 0x5f, 0x85, 0x86, 0x87, 0x92, 0x93];
+const MODE_PADDING: [usize; 5] = [0x9a, 0x9b, 0xa7, 0xb6, 0xb7];
+
+/// Returns the reply as Fast DDS 3 would send it, with bytes of an earlier message as padding.
+fn with_undefined_padding(reply: &[u8], padding: &[usize]) -> Vec<u8> {
+    let mut changed = reply.to_vec();
+    for position in padding {
+        changed[*position] = 0xa5;
+    }
+    changed
+}
+
+#[test]
+fn objects_with_undefined_padding_have_their_hash() {
+    for (reply, padding) in [
+        (THING, &THING_PADDING[..]),
+        (TICKS, &TICKS_PADDING),
+        (MODE, &MODE_PADDING),
+    ] {
+        assert!(padding.iter().all(|position| reply[*position] == 0));
+        let changed = with_undefined_padding(reply, padding);
+        assert_eq!(objects(&changed), objects(reply));
+        // Any other byte counts still.
+        let mut forged = changed.clone();
+        forged[0x54 + 12] ^= 1;
+        let failure = objects(&forged).unwrap_err();
+        assert!(matches!(failure, NotUsable::Forged(_)), "{failure}");
+    }
+    let library = library();
+    library.offer_objects(with_undefined_padding(THING, &THING_PADDING).into());
+    library.offer_objects(PART.into());
+    let found = library.find(THING_NAME, Some(THING_HASH)).unwrap();
+    assert!(found.structures().eq(thing().structures()));
+    assert_eq!(library.described_figures().objects_refused, 0);
 }
 
 #[test]
