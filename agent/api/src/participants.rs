@@ -102,6 +102,8 @@ pub struct Participant<'a> {
     /// It does so, and none of its messages by TCP was seen: it has no peer, the connections are
     /// encrypted, or they do not pass this host.
     pub announces_unseen: bool,
+    /// Discovery Server of Fast DDS: it passes on what other participants announce.
+    pub discovery_server: bool,
     /// Restored from saved state; no announcement has confirmed it since the agent started.
     pub restored: bool,
 }

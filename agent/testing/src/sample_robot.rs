@@ -142,6 +142,7 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
             secured: false,
             announces_by_tcp: false,
             announces_unseen: false,
+            discovery_server: false,
             restored: false,
             addresses: Addresses {
                 metatraffic: Box::default(),

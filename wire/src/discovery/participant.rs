@@ -228,6 +228,12 @@ impl ParticipantAnnouncement {
             .map(|found| &*found.value)
     }
 
+    /// Returns whether it is a Discovery Server of Fast DDS, which passes on what others announce.
+    #[must_use]
+    pub fn is_discovery_server(&self) -> bool {
+        matches!(self.property("PARTICIPANT_TYPE"), Some("SERVER" | "BACKUP"))
+    }
+
     /// Returns its host's name, which Cyclone DDS always and Fast DDS sometimes announces.
     #[must_use]
     pub fn host_name(&self) -> Option<&str> {

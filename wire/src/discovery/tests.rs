@@ -197,6 +197,27 @@ fn a_participant_of_fast_dds_is_parsed() {
 }
 
 #[test]
+fn a_discovery_server_is_known_by_the_announced_type_of_participant() {
+    let is_server = |name: &str, value: &str| {
+        let mut properties = Encoder::new(Endianness::Little);
+        properties.u32(1).string(name).string(value);
+        let mut payload = participant_list();
+        payload.parameter(0x0059, &properties.bytes);
+        announced(&payload.bytes).unwrap().is_discovery_server()
+    };
+    for (kind, expected) in [
+        ("SERVER", true),
+        ("BACKUP", true),
+        ("SIMPLE", false),
+        ("CLIENT", false),
+        ("SUPER_CLIENT", false),
+    ] {
+        assert_eq!(is_server("PARTICIPANT_TYPE", kind), expected, "{kind}");
+    }
+    assert!(!is_server("kind", "SERVER"));
+}
+
+#[test]
 fn endpoints_of_fast_dds_are_parsed() {
     let [writer] = captured_endpoints(testing::FAST_SEDP_WRITER)
         .try_into()

@@ -102,13 +102,20 @@ fn overview(answers: &Answers, processes: Option<usize>) -> Finding {
     )
 }
 
+/// Returns whether the participant is a Discovery Server without nodes, such as that of
+/// `fastdds discovery` or `ROS2_EASY_MODE`. Such a server never announces topics.
+fn is_server(participant: &Participant<'_>) -> bool {
+    participant.discovery_server && participant.enclave.is_none()
+}
+
 /// Returns whether the participant is the only one of its domain and announced no endpoints.
 /// Endpoints are announced only to other participants.
 fn is_isolated(participant: &Participant<'_>, participants: &[Participant<'_>]) -> bool {
     let has_nothing = participant.writers == 0 && participant.readers == 0;
     let others = participants.iter();
     let neighbours = others.filter(|other| other.domain_id == participant.domain_id);
-    has_nothing && !participant.secured && neighbours.count() == 1
+    let is_silent = participant.secured || is_server(participant);
+    has_nothing && !is_silent && neighbours.count() == 1
 }
 
 fn isolation_finding(participants: &[Participant<'_>]) -> Option<Finding> {
@@ -138,7 +145,7 @@ fn names(participants: &[Participant<'_>]) -> Option<Finding> {
     let is_nameless = |each: &&Participant<'_>| {
         let has_nothing = each.writers == 0 && each.readers == 0;
         let is_nameless = has_nothing || each.enclave.is_some() && each.nodes.is_empty();
-        let is_silent = each.secured || each.announces_unseen;
+        let is_silent = each.secured || each.announces_unseen || is_server(each);
         !is_silent && is_nameless && !is_isolated(each, participants)
     };
     let nameless = participants.iter().filter(is_nameless);
@@ -646,6 +653,23 @@ mod tests {
         let apart = of(r#"{"domain_id":1},{"domain_id":2}"#);
         let finding = apart.iter().find(|each| each.check == "alone").unwrap();
         assert!(finding.sentence.contains("in domains 1, 2 and"));
+    }
+
+    #[test]
+    fn a_discovery_server_is_neither_alone_nor_a_node_that_was_missed() {
+        let of = |participants: &str| {
+            let participants = format!(r#"{{"participants":[{participants}]}}"#);
+            let findings = check(&answers(&participants, "", ""), None);
+            ["alone", "names"].map(|check| severity(&findings, check))
+        };
+        let server = r#"{"domain_id":3,"discovery_server":true}"#;
+        let client = r#"{"domain_id":3,"enclave":"/","nodes":["/a"],"writers":2}"#;
+        assert_eq!(of(server), [None, None]);
+        assert_eq!(of(&format!("{server},{client}")), [None, None]);
+        // The nodes of a process that also runs a server may have been missed.
+        let node = r#"{"domain_id":3,"enclave":"/","discovery_server":true}"#;
+        let expected = [None, Some(Severity::Warning)];
+        assert_eq!(of(&format!("{node},{client}")), expected);
     }
 
     #[test]

@@ -307,6 +307,7 @@ fn participants_with_dds_security_or_without_an_address_are_not_contacted() {
         secured,
         announces_by_tcp: false,
         announces_unseen: false,
+        discovery_server: false,
         restored: false,
         addresses: Addresses {
             metatraffic: metatraffic.iter().map(|it| it.parse().unwrap()).collect(),

@@ -177,6 +177,8 @@ pub struct ParticipantFacts {
     pub announces_by_tcp: bool,
     /// Whether it does so, and none of its messages by TCP was seen.
     pub announces_unseen: bool,
+    /// Whether it is a Discovery Server of Fast DDS.
+    pub discovery_server: bool,
     /// Whether it is restored from saved state without a packet so far.
     pub restored: bool,
     /// UDP addresses of its discovery endpoints and of its other endpoints.

@@ -189,6 +189,23 @@ pub fn participant_by_tcp(prefix: GuidPrefix, address: SocketAddrV4) -> Vec<u8> 
     ])
 }
 
+/// Returns the SPDP payload of a participant of Fast DDS that announces this type of participant.
+pub fn participant_of_type(prefix: GuidPrefix, kind: &str) -> Vec<u8> {
+    let guid = Guid::new(prefix, EntityId::PARTICIPANT);
+    let mut properties = 1u32.to_le_bytes().to_vec();
+    for octets in [text("PARTICIPANT_TYPE"), text(kind)] {
+        properties.extend(octets);
+        properties.resize(properties.len().next_multiple_of(4), 0);
+    }
+    encapsulated(&[
+        (0x15, vec![2, 3]),
+        (0x16, vec![1, 0x0f]),
+        (0x50, guid.to_bytes().to_vec()),
+        (0x02, [20u32.to_le_bytes(), [0; 4]].concat()),
+        (0x59, properties),
+    ])
+}
+
 /// Returns the SPDP payload of a participant of Fast DDS with shared memory on this machine, and with
 /// this address.
 pub fn participant_on(prefix: GuidPrefix, machine_id: &str, address: [u8; 4]) -> Vec<u8> {

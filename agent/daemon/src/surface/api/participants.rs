@@ -116,6 +116,7 @@ fn view<'a>(facts: &'a ParticipantFacts, counts: &Counts<'a>, clock: WallClock) 
         secured: facts.secured,
         announces_by_tcp: facts.announces_by_tcp,
         announces_unseen: facts.announces_unseen,
+        discovery_server: facts.discovery_server,
         restored: facts.restored,
     }
 }

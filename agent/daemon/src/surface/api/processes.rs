@@ -107,6 +107,7 @@ mod tests {
             secured: false,
             announces_by_tcp: false,
             announces_unseen: false,
+            discovery_server: false,
             restored: false,
             addresses: Default::default(),
         }

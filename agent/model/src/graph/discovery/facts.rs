@@ -76,6 +76,8 @@ pub struct ParticipantProxy {
     pub tcp: bool,
     /// Whether it announces its endpoints by TCP and not by UDP.
     pub announces_by_tcp: bool,
+    /// Whether it is a Discovery Server.
+    pub discovery_server: bool,
     /// Version of its implementation, if announced.
     pub product_version: Option<Arc<str>>,
 }
@@ -226,6 +228,8 @@ impl ParticipantProxy {
                 .any(Locator::is_shared_memory),
             tcp: Locator::are_tcp(&announcement.default_unicast),
             announces_by_tcp: Locator::are_tcp(&announcement.metatraffic_unicast),
+            discovery_server: announcement.is_discovery_server()
+                || is_discovery_server(announcement.guid.prefix),
             product_version: announcement.product_version.as_deref().map(Into::into),
         }
     }

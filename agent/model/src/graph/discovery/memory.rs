@@ -60,6 +60,8 @@ pub struct Remembered {
     tcp: bool,
     #[serde(default)]
     announces_by_tcp: bool,
+    #[serde(default)]
+    discovery_server: bool,
     /// GUID prefixes of the participants that relayed it; older agents did not save them.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     relayers: Option<Vec<String>>,
@@ -218,6 +220,7 @@ impl Remembered {
             shared_memory: proxy.shared_memory,
             tcp: proxy.tcp,
             announces_by_tcp: proxy.announces_by_tcp,
+            discovery_server: proxy.discovery_server,
             relayers: participant.relayers.as_ref().map(|relayers| {
                 let prefixes = relayers.iter().map(|prefix| prefix.to_string());
                 prefixes.collect()
@@ -259,6 +262,7 @@ impl Remembered {
                 shared_memory: self.shared_memory,
                 tcp: self.tcp,
                 announces_by_tcp: self.announces_by_tcp,
+                discovery_server: self.discovery_server,
                 product_version: text(&self.product_version),
             },
             addresses: self.addresses.clone(),

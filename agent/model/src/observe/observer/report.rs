@@ -103,6 +103,7 @@ fn participants(observer: &Observer) -> Vec<ParticipantFacts> {
                 secured: proxy.secured,
                 announces_by_tcp: proxy.announces_by_tcp,
                 announces_unseen: participant.announces_unseen(),
+                discovery_server: proxy.discovery_server,
                 restored: participant.restored.is_some(),
                 addresses: participant.addresses.clone(),
             }

@@ -113,6 +113,32 @@ fn announcements_relayed_by_a_discovery_server_apply_to_their_participant() {
 }
 
 #[test]
+fn a_discovery_server_is_known_by_its_type_or_prefix_also_after_a_restart() {
+    let mut world = World::new(&[]);
+    let kinds = ["SERVER", "BACKUP", "CLIENT", "SIMPLE"];
+    for (number, kind) in (1..).zip(kinds) {
+        let prefix = GuidPrefix([number; 12]);
+        let payload = forge::participant_of_type(prefix, kind);
+        world.put(Message::from(prefix).data(SPDP, 1, &payload));
+    }
+    world.spdp(GuidPrefix(*b"DS\x00_EPROSIMA"), 20);
+    let servers = |world: &mut World| -> Vec<bool> {
+        let participants = world.snapshot().participants;
+        participants.iter().map(|it| it.discovery_server).collect()
+    };
+    let expected = [true, true, false, false, true];
+    assert_eq!(servers(&mut world), expected);
+    let memory = world.observer.memory();
+    let mut restarted = World::new(&[]);
+    restarted.now = world.now;
+    restarted.observer.input(Input::Restored {
+        memory: &memory,
+        now: Timestamp(world.now),
+    });
+    assert_eq!(servers(&mut restarted), expected);
+}
+
+#[test]
 fn a_participant_that_a_discovery_server_announced_once_stays_until_it_is_disposed() {
     let server = GuidPrefix(*b"DS\x00_EPROSIMA");
     let mut world = World::new(&["/**"]);
