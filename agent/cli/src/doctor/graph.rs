@@ -350,10 +350,10 @@ impl OffNetwork {
 
 /// Returns the texts about shared memory of Fast DDS, by the agent's abilities.
 fn shared_memory(health: &Health) -> OffNetwork {
-    let able = |ability: &str| {
-        let mut abilities = health.abilities.iter();
-        abilities.any(|each| each.able && each.ability == ability)
-    };
+    let find = |ability: &str| health.abilities.iter().find(|each| each.ability == ability);
+    let able = |ability: &str| find(ability).is_some_and(|each| each.able);
+    // An agent has a reason only for an ability that is configured.
+    let is_configured = find("shared_memory_exact").is_some_and(|each| each.reason.is_some());
     let (severity, words, remedy): (_, _, Option<AddRemedies>) = if able("shared_memory_exact") {
         let words = "only Fast DDS shared memory; every message is seen";
         (Severity::Ok, words, None)
@@ -364,7 +364,7 @@ fn shared_memory(health: &Health) -> OffNetwork {
                 "capture: {shm: {exact: auto}}    # every message; instruments the senders",
             )
         };
-        (Severity::Note, words, Some(remedy))
+        (Severity::Note, words, (!is_configured).then_some(remedy))
     } else {
         let words = "only Fast DDS shared memory, which is not read";
         let remedy: AddRemedies = |finding| finding.configure("capture: {shm: {mode: auto}}");
@@ -717,6 +717,31 @@ mod tests {
         let both = format!("{},{}", pairs("network"), pairs("data_sharing"));
         let findings = check(&answers(WELL, &topic("/x", &both), ""), None);
         assert_eq!(findings.len(), 1);
+    }
+
+    #[test]
+    fn exact_shared_memory_is_offered_only_where_it_is_off() {
+        let topic = r#"{"name":"/x","passages":[{"passage":"shared_memory","pairs":2}]}"#;
+        let remedies = |exact: &str| {
+            let sampled = r#"{"ability":"shared_memory","able":true}"#;
+            let health = format!(r#"{{"abilities":[{sampled},{exact}]}}"#);
+            let answers = Answers {
+                health: serde_json::from_str(&health).unwrap(),
+                ..answers(WELL, topic, "")
+            };
+            let findings = check(&answers, None);
+            let mut found = findings.iter();
+            let found = found.find(|each| each.check == "shared_memory").unwrap();
+            assert_eq!(found.severity, Severity::Note);
+            found.remedies.len()
+        };
+        assert_eq!(remedies(r#"{"ability":"shared_memory_exact"}"#), 1);
+        let resting =
+            r#""on_demand":true,"reason":"capture.shm.exact is auto, and no client reads""#;
+        for configured in [resting, r#""reason":"cannot connect to the broker""#] {
+            let exact = format!(r#"{{"ability":"shared_memory_exact",{configured}}}"#);
+            assert_eq!(remedies(&exact), 0, "{configured}");
+        }
     }
 
     #[test]

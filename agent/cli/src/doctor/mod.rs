@@ -182,11 +182,11 @@ fn trial_findings(host: &HostState, settings: &CaptureSettings) -> Vec<Finding> 
             false => visibility::untried_findings(&format!("lacks {}", missing.missing_text())),
         };
     }
-    let mut settings = settings.clone();
-    settings.shm.exact = ExactChoice::Off;
-    settings.inside = InsideChoice::Off;
-    match run::probe(&settings) {
-        Ok(facts) => visibility::check(&Visibility::of_trial(facts)),
+    let mut trial = settings.clone();
+    trial.shm.exact = ExactChoice::Off;
+    trial.inside = InsideChoice::Off;
+    match run::probe(&trial) {
+        Ok(facts) => visibility::check(&Visibility::of_trial(facts, settings)),
         Err(error) => visibility::failed_trial_findings(&in_words(&error)),
     }
 }

@@ -4,6 +4,7 @@
 use ros2probe_api::doctor::{Area, Finding, Severity};
 use ros2probe_api::health::Health;
 use ros2probe_daemon::agent_facts::{Ability, AgentFacts};
+use ros2probe_daemon::config::{CaptureSettings, ExactChoice, InsideChoice};
 
 const AREA: Area = Area::Sight;
 /// Source of facts about a running agent.
@@ -24,6 +25,8 @@ pub struct Visibility {
     pub able: Vec<Ability>,
     /// Unavailable abilities, each with the reason.
     pub reasons: Vec<(Ability, String)>,
+    /// Configured abilities that a trial does not test.
+    pub untried: Vec<Ability>,
     /// Origin of these facts.
     pub from: &'static str,
 }
@@ -47,19 +50,26 @@ impl Visibility {
                 .map(|wire| (wire.hook.to_string(), wire.reason.clone())),
             able: able.filter_map(|each| known(&each.ability)).collect(),
             reasons: reasons.collect(),
+            untried: Vec::new(),
             from: HEALTH_SOURCE,
         }
     }
 
-    /// Returns the visibility found by a trial.
+    /// Returns the visibility found by a trial, which never attaches uprobes.
     #[must_use]
-    pub fn of_trial(facts: AgentFacts) -> Self {
+    pub fn of_trial(facts: AgentFacts, settings: &CaptureSettings) -> Self {
+        let is_inside = matches!(settings.inside, InsideChoice::Topics | InsideChoice::Full);
+        let untried = [
+            (settings.shm.exact != ExactChoice::Off).then_some(Ability::SharedMemoryExact),
+            is_inside.then_some(Ability::Inside),
+        ];
         Self {
             source: facts.source.label().to_owned(),
             source_reason: facts.source_reason,
             wire: facts.wire.map(|wire| (wire.hook.to_owned(), wire.reason)),
             able: facts.abilities,
             reasons: facts.missing_abilities,
+            untried: untried.into_iter().flatten().collect(),
             from: TRIAL_SOURCE,
         }
     }
@@ -105,6 +115,7 @@ pub fn check(visibility: &Visibility) -> Vec<Finding> {
     findings.extend(
         blind
             .into_iter()
+            .filter(|ability| !visibility.untried.contains(ability))
             .filter_map(|ability| missing_ability_finding(visibility, ability)),
     );
     findings
@@ -238,9 +249,8 @@ fn missing_ability_finding(visibility: &Visibility, ability: Ability) -> Option<
         ),
         _ => (Severity::Warning, format!("not {}", words(ability)), None),
     };
-    // The configuration is already that of the remedy.
-    let is_configured =
-        reason.is_some_and(|reason| reason.starts_with("capture.shm.exact is auto"));
+    // An agent has a reason only if its configuration is already that of the remedy.
+    let is_configured = ability == Ability::SharedMemoryExact && reason.is_some();
     let remedy = remedy.filter(|_| !is_configured);
     if let Some(reason) = reason {
         sentence = format!("{sentence}: {reason}");
@@ -255,8 +265,11 @@ fn missing_ability_finding(visibility: &Visibility, ability: Ability) -> Option<
 
 #[cfg(test)]
 mod tests {
+    use std::time::Instant;
+
     use super::*;
     use ros2probe_api::doctor::RemedyTarget;
+    use ros2probe_daemon::agent_facts::SourceKind;
     use ros2probe_daemon::config::Config;
 
     fn host(able: &[Ability]) -> Visibility {
@@ -272,8 +285,7 @@ mod tests {
     }
 
     #[test]
-    fn exact_shared_memory_has_no_remedy_while_no_client_reads() {
-        let reason = "capture.shm.exact is auto, and no client reads samples";
+    fn exact_shared_memory_has_no_remedy_if_it_is_configured() {
         let mut visibility = host(&[]);
         let remedies = |visibility: &Visibility| {
             let findings = check(visibility);
@@ -281,8 +293,28 @@ mod tests {
             found.remedies.len()
         };
         assert_eq!(remedies(&visibility), 1);
-        visibility.reasons = vec![(Ability::SharedMemoryExact, reason.to_owned())];
-        assert_eq!(remedies(&visibility), 0);
+        for reason in [
+            "capture.shm.exact is auto, and no client reads samples",
+            "cannot connect to the broker at /run/ros2probe-attach.sock",
+        ] {
+            visibility.reasons = vec![(Ability::SharedMemoryExact, reason.to_owned())];
+            assert_eq!(remedies(&visibility), 0, "{reason}");
+        }
+    }
+
+    #[test]
+    fn a_trial_does_not_report_abilities_that_are_configured_and_that_it_does_not_test() {
+        let missing = |settings: &CaptureSettings| {
+            let facts = AgentFacts::new(SourceKind::Host, Instant::now());
+            let findings = check(&Visibility::of_trial(facts, settings));
+            ["shared_memory_exact", "inside"].map(|check| find(&findings, check).is_some())
+        };
+        let mut settings = Config::default().capture;
+        assert_eq!(settings.shm.exact, ExactChoice::Auto);
+        assert_eq!(missing(&settings), [false, true]);
+        settings.shm.exact = ExactChoice::Off;
+        settings.inside = InsideChoice::Full;
+        assert_eq!(missing(&settings), [true, false]);
     }
 
     #[test]
