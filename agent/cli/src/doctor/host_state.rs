@@ -127,6 +127,16 @@ impl Files {
         number.map_err(|_| ReadFailure::Other(format!("`{text}` is not a number")))
     }
 
+    /// Returns the target of a symbolic link.
+    ///
+    /// # Errors
+    ///
+    /// Fails if the link cannot be read.
+    pub fn link(&self, path: &str) -> Result<String, ReadFailure> {
+        let target = fs::read_link(self.path(path))?;
+        Ok(target.to_string_lossy().into_owned())
+    }
+
     /// Returns the sorted names in a directory.
     ///
     /// # Errors

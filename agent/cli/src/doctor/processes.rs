@@ -40,6 +40,15 @@ struct Process {
     has_agnocast: bool,
     /// Domain of its participant.
     domain_id: Option<u32>,
+    /// Its network namespace; `None` if that is the one of this process, or unknown.
+    other_network: Option<String>,
+}
+
+/// ROS processes of one network namespace.
+struct Neighbours<'a> {
+    found: Vec<&'a Process>,
+    /// The namespace, unless it is the one of this process.
+    other_network: Option<&'a str>,
 }
 
 /// ROS processes of this host.
@@ -65,6 +74,7 @@ impl Processes {
                 domains.insert(id, (participant.domain_id, node));
             }
         }
+        let own_network = host.files.link("/proc/self/ns/net").ok();
         let mut processes = Self::default();
         for id in host.files.processes() {
             let command = command(host, id);
@@ -85,7 +95,12 @@ impl Processes {
             };
             match read_process(host, id, command, domain_id) {
                 Ok(Some(_)) if processes.found.len() >= MAX_PROCESSES => break,
-                Ok(Some(process)) => processes.found.push(process),
+                Ok(Some(process)) => processes.found.push(Process {
+                    other_network: own_network
+                        .as_ref()
+                        .and_then(|own| process.other_network.filter(|network| network != own)),
+                    ..process
+                }),
                 Ok(None) | Err(ReadFailure::Missing | ReadFailure::Other(_)) => {}
                 Err(ReadFailure::NotPermitted) => processes.closed.push(id),
             }
@@ -101,16 +116,22 @@ impl Processes {
 
     /// Returns process id and domain of the daemons of the `ros2` command line.
     pub fn ros2_daemons(&self) -> impl Iterator<Item = (u32, Option<u32>)> {
-        let found = self.found.iter();
-        let daemons = found.filter(|process| process.command.starts_with(ROS2_DAEMON));
+        let daemons = self
+            .of_own_network()
+            .filter(|process| process.command.starts_with(ROS2_DAEMON));
         daemons.map(|process| (process.id, process.domain_id()))
     }
 
     /// Returns whether any process is limited to its own host.
     #[must_use]
     pub fn is_any_local(&self) -> bool {
-        let mut found = self.found.iter();
+        let mut found = self.of_own_network();
         found.any(|process| process.variables.range() == Range::Localhost)
+    }
+
+    fn of_own_network(&self) -> impl Iterator<Item = &Process> {
+        let found = self.found.iter();
+        found.filter(|process| process.other_network.is_none())
     }
 
     /// Returns the findings for differences among the processes and from this shell.
@@ -120,66 +141,7 @@ impl Processes {
         findings.extend(self.unseen(host.is_root()));
         findings.extend(self.unread_implementations());
         findings.extend(self.agnocast());
-        let domains = self.different_values(
-            "domain",
-            "nodes in different domains do not see each other",
-            "export ROS_DOMAIN_ID=N    # the same for all nodes",
-            |process| Some(process.domain()),
-        );
-        let implementations = self.different_values(
-            "rmw",
-            "mixed RMWs: topics may work only partly, services are unreliable",
-            "export RMW_IMPLEMENTATION=rmw_cyclonedds_cpp    # the same for all nodes",
-            |process| process.implementation.map(str::to_owned),
-        );
-        let ranges = self.different_values(
-            "range",
-            "nodes limited to localhost are not discovered from other hosts",
-            "export ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET    # the same for all; unset ROS_LOCALHOST_ONLY",
-            |process| Some(process.variables.range().words()),
-        );
-        let servers = self.different_values(
-            "discovery_server",
-            "nodes with different discovery servers do not discover each other",
-            "export ROS_DISCOVERY_SERVER=ADDRESS:11811    # the same for all, or unset for all",
-            |process| {
-                let server = process.variables.shown("ROS_DISCOVERY_SERVER");
-                Some(server.map_or_else(
-                    || "no server".to_owned(),
-                    |server| format!("server {server}"),
-                ))
-            },
-        );
-        let easy_modes = self.different_values(
-            "easy_mode",
-            "nodes in easy mode see only nodes with the same server",
-            "export ROS2_EASY_MODE=ADDRESS    # the same for all, or unset for all",
-            |process| {
-                let server = process.variables.shown("ROS2_EASY_MODE");
-                Some(server.map_or_else(
-                    || "no easy mode".to_owned(),
-                    |server| format!("easy mode {server}"),
-                ))
-            },
-        );
-        let security = self.different_values(
-            "security",
-            "secured and unsecured nodes do not communicate",
-            "export ROS_SECURITY_ENABLE=true    # for all, or for none",
-            |process| {
-                let is_secured = process.variables.is_secured();
-                Some(if is_secured { "secured" } else { "not secured" }.to_owned())
-            },
-        );
-        let all = [
-            domains,
-            implementations,
-            ranges,
-            servers,
-            easy_modes,
-            security,
-        ];
-        findings.extend(all.into_iter().flatten());
+        findings.extend(self.by_network().iter().flat_map(Neighbours::differences));
         findings.extend(self.different_domain(&Variables::of(&host.environment)));
         findings
     }
@@ -248,17 +210,27 @@ impl Processes {
             let sentence = "no ROS process was found on this host";
             return report(Severity::Note, sentence.to_owned()).seen("0", "/proc/<pid>/maps");
         };
+        let apart = self.found.len() - self.of_own_network().count();
+        let apart = match apart {
+            0 => String::new(),
+            1 => ", 1 in another network namespace".to_owned(),
+            count => format!(", {count} in other network namespaces"),
+        };
         let mut finding = report(
             Severity::Ok,
             match self.found.len() {
-                1 => format!("1 ROS process: {}", first.name()),
-                count => format!("{count} ROS processes"),
+                1 => format!("1 ROS process: {}{apart}", first.name()),
+                count => format!("{count} ROS processes{apart}"),
             },
         );
         for process in &self.found {
             let (implementation, range) = (process.implementation, process.variables.range());
+            let apart = match process.other_network {
+                Some(_) => ", another network namespace",
+                None => "",
+            };
             let value = format!(
-                "{}: {}, {}, {}",
+                "{}: {}, {}, {}{apart}",
                 process.name(),
                 process.domain(),
                 implementation.unwrap_or("unknown implementation"),
@@ -267,6 +239,108 @@ impl Processes {
             finding = finding.seen(value, format!("/proc/{}/environ, maps", process.id));
         }
         finding
+    }
+
+    /// Returns the processes by network namespace, beginning with that of this process.
+    fn by_network(&self) -> Vec<Neighbours<'_>> {
+        let mut networks: BTreeMap<_, Vec<&Process>> = BTreeMap::new();
+        for process in &self.found {
+            let other_network = process.other_network.as_deref();
+            networks.entry(other_network).or_default().push(process);
+        }
+        let networks = networks.into_iter();
+        let networks = networks.map(|(other_network, found)| Neighbours {
+            found,
+            other_network,
+        });
+        networks.collect()
+    }
+
+    /// Warns if no process is in the domain of this shell.
+    fn different_domain(&self, shell: &Variables) -> Option<Finding> {
+        let own = shell.domain().ok().filter(|_| shell.is_ros())?;
+        let mut domains: Vec<_> = self.of_own_network().map(Process::domain_id).collect();
+        domains.sort_unstable();
+        domains.dedup();
+        let first = (*domains.first()?)?;
+        if domains.contains(&Some(own)) {
+            return None;
+        }
+        let listed: Vec<_> = domains.iter().flatten().map(u32::to_string).collect();
+        let sentence = format!(
+            "this shell uses domain {own}, all ROS processes use {}: its tools will not find them",
+            listed.join(", ")
+        );
+        let finding = Finding::new(AREA, "shell_domain", Severity::Warning, sentence);
+        let finding = finding.seen(own.to_string(), "ROS_DOMAIN_ID, this shell");
+        Some(finding.remedy(format!("export ROS_DOMAIN_ID={first}")))
+    }
+}
+
+impl Neighbours<'_> {
+    /// Returns the findings for settings that differ. Processes of several namespaces are not
+    /// compared: whether they reach one another is unknown.
+    fn differences(&self) -> Vec<Finding> {
+        let domains = self.different_values(
+            "domain",
+            "nodes in different domains do not see each other",
+            "export ROS_DOMAIN_ID=N    # the same for all nodes",
+            |process| Some(process.domain()),
+        );
+        let implementations = self.different_values(
+            "rmw",
+            "mixed RMWs: topics may work only partly, services are unreliable",
+            "export RMW_IMPLEMENTATION=rmw_cyclonedds_cpp    # the same for all nodes",
+            |process| process.implementation.map(str::to_owned),
+        );
+        let ranges = self.different_values(
+            "range",
+            "nodes limited to localhost are not discovered from other hosts",
+            "export ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET    # the same for all; unset ROS_LOCALHOST_ONLY",
+            |process| Some(process.variables.range().words()),
+        );
+        let servers = self.different_values(
+            "discovery_server",
+            "nodes with different discovery servers do not discover each other",
+            "export ROS_DISCOVERY_SERVER=ADDRESS:11811    # the same for all, or unset for all",
+            |process| {
+                let server = process.variables.shown("ROS_DISCOVERY_SERVER");
+                Some(server.map_or_else(
+                    || "no server".to_owned(),
+                    |server| format!("server {server}"),
+                ))
+            },
+        );
+        let easy_modes = self.different_values(
+            "easy_mode",
+            "nodes in easy mode see only nodes with the same server",
+            "export ROS2_EASY_MODE=ADDRESS    # the same for all, or unset for all",
+            |process| {
+                let server = process.variables.shown("ROS2_EASY_MODE");
+                Some(server.map_or_else(
+                    || "no easy mode".to_owned(),
+                    |server| format!("easy mode {server}"),
+                ))
+            },
+        );
+        let security = self.different_values(
+            "security",
+            "secured and unsecured nodes do not communicate",
+            "export ROS_SECURITY_ENABLE=true    # for all, or for none",
+            |process| {
+                let is_secured = process.variables.is_secured();
+                Some(if is_secured { "secured" } else { "not secured" }.to_owned())
+            },
+        );
+        let all = [
+            domains,
+            implementations,
+            ranges,
+            servers,
+            easy_modes,
+            security,
+        ];
+        all.into_iter().flatten().collect()
     }
 
     /// Warns if processes have different values of `key`.
@@ -278,7 +352,7 @@ impl Processes {
         key: impl Fn(&Process) -> Option<String>,
     ) -> Option<Finding> {
         let mut groups: BTreeMap<String, Vec<&Process>> = BTreeMap::new();
-        for process in &self.found {
+        for &process in &self.found {
             if let Some(key) = key(process) {
                 groups.entry(key).or_default().push(process);
             }
@@ -294,7 +368,11 @@ impl Processes {
             .take(MAX_NAMED_PROCESSES)
             .map(|(key, group)| format!("{key}: {}", names(group)))
             .collect();
-        let sentence = format!("{consequence}; {}", named.join("; "));
+        let place = match self.other_network {
+            Some(_) => " (in another network namespace)",
+            None => "",
+        };
+        let sentence = format!("{consequence}{place}; {}", named.join("; "));
         let mut finding = Finding::new(AREA, check, Severity::Warning, sentence);
         for (key, group) in &groups {
             let from = group.iter().map(|process| process.id.to_string());
@@ -302,26 +380,6 @@ impl Processes {
             finding = finding.seen(key, format!("processes {}", from.join(", ")));
         }
         Some(finding.remedy(remedy))
-    }
-
-    /// Warns if no process is in the domain of this shell.
-    fn different_domain(&self, shell: &Variables) -> Option<Finding> {
-        let own = shell.domain().ok().filter(|_| shell.is_ros())?;
-        let mut domains: Vec<_> = self.found.iter().map(Process::domain_id).collect();
-        domains.sort_unstable();
-        domains.dedup();
-        let first = (*domains.first()?)?;
-        if domains.contains(&Some(own)) {
-            return None;
-        }
-        let listed: Vec<_> = domains.iter().flatten().map(u32::to_string).collect();
-        let sentence = format!(
-            "this shell uses domain {own}, all ROS processes use {}: its tools will not find them",
-            listed.join(", ")
-        );
-        let finding = Finding::new(AREA, "shell_domain", Severity::Warning, sentence);
-        let finding = finding.seen(own.to_string(), "ROS_DOMAIN_ID, this shell");
-        Some(finding.remedy(format!("export ROS_DOMAIN_ID={first}")))
     }
 }
 
@@ -364,6 +422,7 @@ fn read_process(
         implementation,
         has_agnocast: names_of_files(&map).any(|name| name.starts_with("libagnocast")),
         domain_id,
+        other_network: host.files.link(&format!("/proc/{id}/ns/net")).ok(),
     }))
 }
 
@@ -451,6 +510,9 @@ fn names(processes: &[&Process]) -> String {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+    use std::os::unix::fs::symlink;
+
     use super::super::host_state::tests::host;
     use super::*;
 
@@ -534,6 +596,51 @@ mod tests {
         );
         assert_eq!(sentence(&findings, "security"), None);
         assert_eq!(sentence(&findings, "discovery_server"), None);
+    }
+
+    #[test]
+    fn processes_are_compared_within_their_network_namespace_only() {
+        let mut files = Vec::new();
+        for (id, domain) in [(11, 3), (12, 3), (13, 9), (14, 8)] {
+            files.push((format!("/proc/{id}/cmdline"), format!("node{id}")));
+            let variables = format!("ROS_DOMAIN_ID={domain}");
+            files.push((format!("/proc/{id}/environ"), variables));
+            files.push((format!("/proc/{id}/maps"), FAST.to_owned()));
+        }
+        let files: Vec<_> = files
+            .iter()
+            .map(|(path, text)| (path.as_str(), text.as_str()))
+            .collect();
+        let (_directory, mut host) = host(&files);
+        let own = ["self", "11", "12"].map(|id| (id, "net:[1]"));
+        let other = ["13", "14"].map(|id| (id, "net:[2]"));
+        for (id, network) in own.into_iter().chain(other) {
+            let directory = host.files.path(&format!("/proc/{id}/ns"));
+            fs::create_dir_all(&directory).unwrap();
+            symlink(network, directory.join("net")).unwrap();
+        }
+        let shell = [("ROS_DISTRO", "jazzy"), ("ROS_DOMAIN_ID", "9")];
+        let shell = shell.map(|(name, value)| (name.to_owned(), value.to_owned()));
+        host.environment = shell.into();
+        let findings = Processes::find(&host, None).check(&host);
+        let domains = findings.iter().filter(|finding| finding.check == "domain");
+        let domains: Vec<_> = domains.map(|finding| &*finding.sentence).collect();
+        assert_eq!(
+            domains,
+            [
+                "nodes in different domains do not see each other (in another network namespace); \
+                 domain 8: node14 (14); domain 9: node13 (13)"
+            ]
+        );
+        let overview = &findings[0];
+        assert_eq!(
+            overview.sentence,
+            "4 ROS processes, 2 in other network namespaces"
+        );
+        let last = &overview.evidence[3].value;
+        assert!(last.ends_with(", another network namespace"), "{last}");
+        // Tools in this shell find no process, because that of its domain has another network.
+        assert!(sentence(&findings, "shell_domain").is_some());
     }
 
     #[test]
