@@ -594,14 +594,23 @@ impl Run {
     }
 }
 
-/// Returns the use of the tables of described types and of TypeObjects.
-const fn tables(described: &DescribedFigures) -> [TableFacts; 2] {
+/// Returns the use of the tables of described types, of what nodes sent about types, and of
+/// TypeObjects.
+const fn tables(described: &DescribedFigures) -> [TableFacts; 3] {
     let types = TableFacts {
         table: "type_descriptions",
         size: described.types as u64,
         limit: DescribedFigures::MAX_TYPES as u64,
         bytes: Some((described.bytes as u64, DescribedFigures::MAX_BYTES as u64)),
         evictions: described.evicted,
+    };
+    let max_bytes = DescribedFigures::MAX_WAITING_BYTES as u64;
+    let sources = TableFacts {
+        table: "type_sources",
+        size: described.waiting as u64,
+        limit: DescribedFigures::MAX_WAITING as u64,
+        bytes: Some((described.waiting_bytes as u64, max_bytes)),
+        evictions: described.waiting_evicted,
     };
     let max_bytes = DescribedFigures::MAX_OBJECT_BYTES as u64;
     let objects = TableFacts {
@@ -611,7 +620,7 @@ const fn tables(described: &DescribedFigures) -> [TableFacts; 2] {
         bytes: Some((described.object_bytes as u64, max_bytes)),
         evictions: described.objects_evicted,
     };
-    [types, objects]
+    [types, sources, objects]
 }
 
 /// Returns the number of descriptions that could not be used, by reason.
@@ -643,4 +652,31 @@ fn follow(live: &mut LiveSource, followed: &mut BTreeSet<GuidPrefix>, snapshot: 
         live.follow(*new, true);
     }
     *followed = present;
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn evictions_are_beside_the_limit_that_was_reached() {
+        let evicted = |described: DescribedFigures| {
+            let tables = tables(&described).into_iter();
+            let full = tables.filter(|table| table.evictions > 0);
+            let full = full.map(|table| (table.table, table.limit, table.evictions));
+            full.collect::<Vec<_>>()
+        };
+        let waiting = DescribedFigures {
+            waiting_evicted: 7,
+            ..DescribedFigures::default()
+        };
+        let limit = DescribedFigures::MAX_WAITING as u64;
+        assert_eq!(evicted(waiting), [("type_sources", limit, 7)]);
+        let types = DescribedFigures {
+            evicted: 3,
+            ..DescribedFigures::default()
+        };
+        let limit = DescribedFigures::MAX_TYPES as u64;
+        assert_eq!(evicted(types), [("type_descriptions", limit, 3)]);
+    }
 }

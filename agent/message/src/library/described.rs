@@ -83,15 +83,21 @@ pub(super) enum NotSent {
 pub struct DescribedFigures {
     /// Described types that are kept.
     pub types: usize,
-    /// Bytes of their definitions, and of responses and replies that wait.
+    /// Bytes of their definitions.
     pub bytes: usize,
+    /// Responses and replies that wait until a lookup reads them.
+    pub waiting: usize,
+    /// Bytes of these responses and replies.
+    pub waiting_bytes: usize,
+    /// Responses and replies dropped unread because of a cap.
+    pub waiting_evicted: u64,
     /// Types that were described for the first time.
     pub learned: u64,
     /// Number of rejected responses.
     pub refused: u64,
     /// Lookups for which only descriptions with another hash than the announced one exist.
     pub mismatched: u64,
-    /// Responses, replies and types dropped because of a cap.
+    /// Described types dropped because of a cap.
     pub evicted: u64,
     /// TypeObjects that are kept.
     pub objects: usize,
@@ -107,7 +113,11 @@ impl DescribedFigures {
     /// Maximum of `types`.
     pub const MAX_TYPES: usize = MAX_TYPES;
     /// Maximum of `bytes`.
-    pub const MAX_BYTES: usize = MAX_BYTES + MAX_WAITING_BYTES;
+    pub const MAX_BYTES: usize = MAX_BYTES;
+    /// Maximum of `waiting`.
+    pub const MAX_WAITING: usize = MAX_WAITING;
+    /// Maximum of `waiting_bytes`.
+    pub const MAX_WAITING_BYTES: usize = MAX_WAITING_BYTES;
     /// Maximum of `objects`.
     pub const MAX_OBJECTS: usize = Objects::MAX;
     /// Maximum of `object_bytes`.
@@ -217,11 +227,14 @@ impl Described {
         let (waiting, types) = (locked(&self.waiting), locked(&self.types));
         DescribedFigures {
             types: types.kept.entries.len(),
-            bytes: types.kept.bytes + waiting.bytes,
+            bytes: types.kept.bytes,
+            waiting: waiting.sources.len(),
+            waiting_bytes: waiting.bytes,
+            waiting_evicted: waiting.evicted,
             learned: types.kept.added,
             refused: types.refused + waiting.refused,
             mismatched: types.mismatched,
-            evicted: types.kept.evicted + waiting.evicted,
+            evicted: types.kept.evicted,
             objects: types.objects,
             object_bytes: types.object_bytes,
             objects_refused: types.objects_refused + waiting.refused_objects,

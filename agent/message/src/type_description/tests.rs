@@ -362,7 +362,26 @@ fn waiting_responses_and_forged_types_are_bounded_and_do_not_displace_used_ones(
         library.offer(vec![number as u8; 200_000].into());
     }
     let figures = library.described_figures();
-    assert!(figures.bytes <= DescribedFigures::MAX_BYTES, "{figures:?}");
+    let most = DescribedFigures::MAX_WAITING_BYTES;
+    assert!(figures.waiting_bytes <= most, "{figures:?}");
+}
+
+#[test]
+fn responses_that_are_dropped_unread_count_apart_from_types() {
+    let library = library();
+    let most = DescribedFigures::MAX_WAITING;
+    for number in 0..most + 2 {
+        library.offer(vec![number as u8; 8].into());
+    }
+    let figures = library.described_figures();
+    let waiting = (
+        figures.waiting,
+        figures.waiting_bytes,
+        figures.waiting_evicted,
+    );
+    assert_eq!(waiting, (most, 8 * most, 2));
+    let types = (figures.types, figures.bytes, figures.evicted);
+    assert_eq!(types, (0, 0, 0));
 }
 
 #[test]
