@@ -20,7 +20,8 @@ const POLICIES = /** @type {[string, string, (qos: any) => string][]} */ ([
   ['lifespan', 'Lifespan', (qos) => infinite(qos.lifespan_seconds)],
   ['liveliness', 'Liveliness', (qos) => qos.liveliness],
   ['liveliness', 'Liveliness lease', (qos) => infinite(qos.liveliness_lease_seconds)],
-  ['ownership', 'Ownership', (qos) => qos.ownership],
+  ['ownership', 'Ownership', (qos) => (qos.ownership_strength == null ? qos.ownership
+    : `${qos.ownership} (${qos.ownership_strength})`)],
   ['partition', 'Partitions', (qos) => qos.partitions.join(', ') || 'default'],
 ]);
 

@@ -135,6 +135,8 @@ impl DataRepresentation {
     pub const XCDR2: Self = Self(2);
 }
 
+/// PID_OWNERSHIP_STRENGTH (RTPS 2.5, table 9.14).
+const OWNERSHIP_STRENGTH: ParameterId = ParameterId(0x0006);
 /// Maximum number of representations kept per endpoint; three are defined.
 const MAX_REPRESENTATIONS: u32 = 8;
 /// Maximum number of partitions per endpoint; ROS 2 uses none.
@@ -161,6 +163,8 @@ pub struct Qos {
     pub liveliness_lease: RtpsDuration,
     /// Ownership.
     pub ownership: Ownership,
+    /// Strength of a writer with exclusive ownership: readers accept the samples of the strongest.
+    pub ownership_strength: i32,
     /// Minimum time between two samples that a reader accepts.
     pub minimum_separation: RtpsDuration,
     /// Delay that the implementation may add to save work.
@@ -202,6 +206,7 @@ impl Qos {
             liveliness: Liveliness::AUTOMATIC,
             liveliness_lease: RtpsDuration::Infinite,
             ownership: Ownership::SHARED,
+            ownership_strength: 0,
             minimum_separation: RtpsDuration::Finite(Duration::ZERO),
             latency_budget: RtpsDuration::Finite(Duration::ZERO),
             destination_order: DestinationOrder::BY_RECEPTION_TIMESTAMP,
@@ -243,6 +248,7 @@ impl Qos {
                 self.liveliness_lease = duration(&mut value, "PID_LIVELINESS")?;
             }
             ParameterId::OWNERSHIP => self.ownership = Ownership(value.u32("PID_OWNERSHIP")?),
+            OWNERSHIP_STRENGTH => self.ownership_strength = value.i32("PID_OWNERSHIP_STRENGTH")?,
             ParameterId::TIME_BASED_FILTER => {
                 self.minimum_separation = duration(&mut value, "PID_TIME_BASED_FILTER")?;
             }
@@ -350,6 +356,21 @@ mod tests {
             qos.liveliness_lease,
             RtpsDuration::Finite(Duration::from_millis(1500))
         );
+    }
+
+    #[test]
+    fn the_strength_of_exclusive_ownership_is_read_with_its_sign() {
+        let mut qos = Qos::defaults(Role::Writer, VendorId::CYCLONE);
+        apply(&mut qos, ParameterId::OWNERSHIP, &[1, 0, 0, 0]).unwrap();
+        assert_eq!(
+            (qos.ownership, qos.ownership_strength),
+            (Ownership::EXCLUSIVE, 0)
+        );
+        for (value, strength) in [([8_u8, 0, 0, 0], 8), ([0xfe, 0xff, 0xff, 0xff], -2)] {
+            assert_eq!(apply(&mut qos, OWNERSHIP_STRENGTH, &value), Ok(true));
+            assert_eq!(qos.ownership_strength, strength);
+        }
+        assert!(apply(&mut qos, OWNERSHIP_STRENGTH, &[8, 0]).is_err());
     }
 
     #[test]

@@ -141,6 +141,8 @@ pub struct Qos<'a> {
     pub liveliness_lease_seconds: Option<f64>,
     #[cfg_attr(feature = "openapi", schema(example = "SHARED"))]
     pub ownership: Cow<'static, str>,
+    /// Strength of a publisher with exclusive ownership; null for other endpoints.
+    pub ownership_strength: Option<i32>,
     /// Partitions; empty for the default partition.
     pub partitions: Vec<Cow<'a, str>>,
 }

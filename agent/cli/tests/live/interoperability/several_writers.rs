@@ -161,6 +161,11 @@ fn messages_of_a_weaker_publisher_are_not_lost() -> Result<()> {
                 assert_eq!(endpoint["qos"]["ownership"], "EXCLUSIVE", "{topic}");
             }
         }
+        let publishers = topic["publishers"].as_array().context("no publishers")?;
+        let strengths = publishers.iter();
+        let strengths = strengths.map(|each| each["qos"]["ownership_strength"].as_i64());
+        let strengths: BTreeSet<_> = strengths.collect();
+        assert_eq!(strengths, BTreeSet::from([Some(4), Some(8)]), "{topic}");
         // The weaker publisher's samples reach the process, and its library ignores them.
         let subscriber = only_subscriber(scene)?;
         let expected = BTreeMap::from([(("SHARED".to_owned(), 8), all())]);

@@ -8,6 +8,7 @@ use crate::latched::latched;
 use ros2probe_api::endpoints::{Endpoint, Process, Qos};
 use ros2probe_model::facts::wall_clock::WallClock;
 use ros2probe_model::report::snapshot::{EndpointFacts, ProcessFacts};
+use ros2probe_wire::qos::Ownership;
 use ros2probe_wire::rtps::VendorId;
 
 /// Returns the API representation of a writer or reader.
@@ -39,6 +40,9 @@ pub(super) fn endpoint<'a>(
             liveliness: Cow::Borrowed(qos.liveliness.label()),
             liveliness_lease_seconds: qos.liveliness_lease.seconds(),
             ownership: Cow::Borrowed(qos.ownership.label()),
+            ownership_strength: (qos.ownership == Ownership::EXCLUSIVE
+                && facts.guid.entity.is_writer())
+            .then_some(qos.ownership_strength),
             partitions: texts(&qos.partitions),
         },
         backends: facts
@@ -84,4 +88,30 @@ pub(super) fn texts<T: AsRef<str>>(texts: &[T]) -> Vec<Cow<'_, str>> {
 /// Formats each value.
 pub(super) fn printed<T: ToString>(values: &[T]) -> Vec<String> {
     values.iter().map(ToString::to_string).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use ros2probe_testing::sample_robot;
+
+    use super::*;
+
+    #[test]
+    fn only_publishers_with_exclusive_ownership_have_a_strength() {
+        let snapshot = sample_robot::snapshot(["/points"]);
+        let index = Index::new(&snapshot);
+        let strength = |ownership: Ownership, kind: u8| {
+            let mut facts = snapshot.topics[0].publishers[0].clone();
+            facts.guid.entity.0[3] = kind;
+            let qos = Arc::make_mut(&mut facts.qos);
+            (qos.ownership, qos.ownership_strength) = (ownership, 8);
+            let shown = endpoint(&facts, &index, WallClock::default());
+            shown.qos.ownership_strength
+        };
+        assert_eq!(strength(Ownership::EXCLUSIVE, 3), Some(8));
+        assert_eq!(strength(Ownership::SHARED, 3), None);
+        assert_eq!(strength(Ownership::EXCLUSIVE, 4), None);
+    }
 }

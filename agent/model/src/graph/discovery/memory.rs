@@ -100,6 +100,9 @@ struct RememberedEndpoint {
     liveliness: u32,
     liveliness_lease: Option<u64>,
     ownership: u32,
+    /// Older agents did not save it.
+    #[serde(default)]
+    ownership_strength: i32,
     minimum_separation: Option<u64>,
     partitions: Vec<String>,
     /// Properties that only matching needs; older agents did not save them.
@@ -333,6 +336,7 @@ impl RememberedEndpoint {
             liveliness: qos.liveliness.0,
             liveliness_lease: nanoseconds(qos.liveliness_lease),
             ownership: qos.ownership.0,
+            ownership_strength: qos.ownership_strength,
             minimum_separation: nanoseconds(qos.minimum_separation),
             partitions: qos.partitions.iter().map(ToString::to_string).collect(),
             matching: Matching::of(qos),
@@ -395,6 +399,7 @@ impl RememberedEndpoint {
                 liveliness: Liveliness(self.liveliness),
                 liveliness_lease: duration(self.liveliness_lease),
                 ownership: Ownership(self.ownership),
+                ownership_strength: self.ownership_strength,
                 minimum_separation: duration(self.minimum_separation),
                 partitions: self
                     .partitions

@@ -215,6 +215,28 @@ fn a_participant_that_a_discovery_server_announced_once_stays_until_it_is_dispos
 }
 
 #[test]
+fn the_strength_of_a_publisher_is_known_also_after_a_restart() {
+    let mut world = World::new(&["/**"]);
+    world.spdp(ALICE, 10);
+    let parameters: [(u16, &[u8]); 2] = [(0x1f, &[1, 0, 0, 0]), (0x06, &[8, 0, 0, 0])];
+    let payload = forge::endpoint_with(alice(WRITER), "rt/chatter", STRING, &parameters);
+    world.put(Message::from(ALICE).data(SEDP_WRITERS, 1, &payload));
+    let strength = |world: &World| {
+        let topic = world.topic(0, "/chatter").unwrap();
+        topic.publishers[0].qos.ownership_strength
+    };
+    assert_eq!(strength(&world), 8);
+    let memory = world.observer.memory();
+    let mut restarted = World::new(&["/**"]);
+    restarted.now = world.now;
+    restarted.observer.input(Input::Restored {
+        memory: &memory,
+        now: Timestamp(world.now),
+    });
+    assert_eq!(strength(&restarted), 8);
+}
+
+#[test]
 fn several_samples_of_several_writers_in_one_datagram_all_count() {
     let mut world = World::new(&["/**"]);
     world.spdp(ALICE, 10);
