@@ -18,7 +18,7 @@ use ros2probe_model::observe::observer::{self, Observer};
 pub use ros2probe_wire::Expansion;
 use tokio_util::sync::CancellationToken;
 
-use crate::config::{Access, Config, ConfigError, PageChoice, RetainChoice, Watch};
+use crate::config::{Access, Config, ConfigError, FleetSettings, PageChoice, RetainChoice, Watch};
 use crate::container;
 use crate::events::EventLog;
 use crate::logging::Log;
@@ -57,6 +57,8 @@ pub const DEFAULT_CONFIG: &str = "/etc/ros2probe/ros2probe.yaml";
 pub struct Options {
     /// Configuration file. `None` means [`DEFAULT_CONFIG`] if it exists.
     pub config: Option<PathBuf>,
+    /// Configuration whose section `fleet` applies instead of the configured one.
+    pub fleet: Option<PathBuf>,
     /// Capture to replay instead of observing this host.
     pub replay: Option<PathBuf>,
     /// Speed of the replay. `None` means as captured, or as fast as possible for a report.
@@ -280,7 +282,10 @@ pub fn run(options: Options) -> Result<()> {
         (None, Some(_)) => (Config::default(), None),
         (file, _) => configuration(file.as_deref())?,
     };
-    let config = with_overrides(&configured, &options);
+    let mut config = with_overrides(&configured, &options);
+    if let Some(file) = &options.fleet {
+        config.fleet = FleetSettings::load(file)?;
+    }
     let log = Log::start(config.log, config.otlp.log);
     let export = export(&config)?;
     let remote_write = remote_write(&config)?;
@@ -767,6 +772,7 @@ mod tests {
         ] {
             let options = Options {
                 config: config.map(PathBuf::from),
+                fleet: None,
                 replay: replay.map(PathBuf::from),
                 speed: None,
                 expansion: Expansion::Limited,

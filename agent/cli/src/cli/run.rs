@@ -19,12 +19,17 @@ RUST_LOG, read at the start, overrides the configured log level.
 
 Examples:
   sudo rp run                                     observe this host
+  sudo rp run --fleet fleet.yaml                  also show the robots of a fleet on the page
   rp run --replay robot.pcap.gz --report          print the capture's metrics to stdout
   rp run --replay robot.pcap --watch '/camera/**' --metrics 127.0.0.1:9400")]
 pub(crate) struct Run {
     /// Configuration file [default: /etc/ros2probe/ros2probe.yaml, if it exists]
     #[arg(long, value_name = "FILE")]
     pub(crate) config: Option<PathBuf>,
+    /// Show a fleet on the page: configuration whose section `fleet` names engine and store, instead
+    /// of the configured section
+    #[arg(long, value_name = "FILE")]
+    pub(crate) fleet: Option<PathBuf>,
     /// Observe a capture (pcap or pcapng, may be gzipped) or a bag of rosbag2 instead of this host;
     /// needs no privilege
     #[arg(long, value_name = "FILE")]
@@ -81,6 +86,7 @@ impl From<Run> for Options {
                 parent,
             }),
             config: run.config,
+            fleet: run.fleet,
             replay: run.replay,
             speed: run.speed,
             expansion: run.compressed.into(),

@@ -326,6 +326,45 @@ fn an_agent_queries_the_engine_only_on_demand() {
 }
 
 #[test]
+fn a_file_for_the_fleet_applies_instead_of_the_configured_section() {
+    let directory = tempfile::tempdir().unwrap();
+    let file = |name: &str, text: &str| {
+        let path = directory.path().join(name);
+        std::fs::write(&path, text).unwrap();
+        path.to_str().unwrap().to_owned()
+    };
+    let configuration = file("ros2probe.yaml", "fleet: {engine: 'http://127.0.0.1:9'}\n");
+    let named = file(
+        "fleet.yaml",
+        &format!("fleet: {{engine: 'http://{}'}}\n", empty()),
+    );
+    let (configuration, named) = (configuration.as_str(), named.as_str());
+    for more in [&[][..], &["--config", configuration][..]] {
+        let arguments = [&["--fleet", named, "--speed", "max"][..], more].concat();
+        let agent = LocalAgent::start(&mut rp(), &arguments);
+        let answer = fleet_of(&agent, |answer| {
+            answer["at"].is_number() || answer["problem"].is_string()
+        });
+        assert_eq!(answer["problem"], Value::Null, "{more:?}");
+    }
+    // A file without an engine would start an agent without the view that the command line asks for.
+    let nothing = file("nothing.yaml", "fleet: {job: robots}\n");
+    let missing = directory.path().join("missing.yaml");
+    for (path, expected) in [
+        (&*nothing, "has no `fleet.engine`"),
+        (missing.to_str().unwrap(), "cannot read the configuration"),
+    ] {
+        let mut command = rp();
+        command.args(["run", "--metrics", "off", "--api", "off", "--fleet", path]);
+        command.arg("--replay").arg(local_agent::capture());
+        let output = command.output().unwrap();
+        let text = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(78), "{text}");
+        assert!(text.contains(expected) && text.contains(path), "{text}");
+    }
+}
+
+#[test]
 fn an_agent_reports_why_the_engine_does_not_answer_or_that_it_has_none() {
     let directory = tempfile::tempdir().unwrap();
     let nowhere = TcpListener::bind("127.0.0.1:0")

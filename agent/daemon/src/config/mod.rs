@@ -392,6 +392,26 @@ pub enum ConfigError {
         /// All mistakes.
         mistakes: Mistakes,
     },
+    /// The file is for the view of a fleet, and names no engine.
+    #[error("{} has no `fleet.engine`, to which the robots of the fleet deliver", path.display())]
+    NoEngine {
+        /// Path of the file.
+        path: PathBuf,
+    },
+}
+
+impl FleetSettings {
+    /// Reads the section `fleet` of a file.
+    ///
+    /// # Errors
+    /// Fails as [`Config::load`] does, and if the section names no engine.
+    pub fn load(path: &Path) -> Result<Self, ConfigError> {
+        let settings = Config::load(path)?.fleet;
+        if settings.engine.is_none() {
+            return Err(ConfigError::NoEngine { path: path.into() });
+        }
+        Ok(settings)
+    }
 }
 
 impl Config {
