@@ -40,6 +40,7 @@ export function keepTime(query) {
 }
 
 /**
+ * Returns the address of a view. Names of robots are HOST:PORT, and a fragment may have colons.
  * @param {string} view
  * @param {string|null} [name]
  * @param {Record<string, string|number|boolean|null|undefined>} [query] empty values are omitted
@@ -49,7 +50,7 @@ export function address(view, name = null, query = {}) {
     .filter(([, value]) => value != null && value !== '' && value !== false)
     .map(([key, value]) => [key, value === true ? '1' : String(value)]);
   const rest = new URLSearchParams(given).toString();
-  const path = name == null ? view : `${view}/${encodeURIComponent(name)}`;
+  const path = name == null ? view : `${view}/${encodeURIComponent(name).replaceAll('%3A', ':')}`;
   return `#/${path}${rest ? `?${rest}` : ''}`;
 }
 

@@ -63,4 +63,7 @@ test('a robot has an address of its own', () => {
   const route = parse(address('fleet', 'robot/7'));
   assert.equal(route?.view, 'fleet');
   assert.equal(route?.name, 'robot/7');
+  const scraped = address('fleet', 'host:17401');
+  assert.equal(scraped, '#/fleet/host:17401');
+  assert.equal(parse(scraped)?.name, 'host:17401');
 });

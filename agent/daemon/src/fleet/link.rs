@@ -3,7 +3,7 @@
 use std::net::Ipv6Addr;
 use std::str::FromStr;
 
-use percent_encoding::{NON_ALPHANUMERIC, utf8_percent_encode};
+use percent_encoding::{AsciiSet, NON_ALPHANUMERIC, utf8_percent_encode};
 
 /// The place of a robot's name in a [`Link`].
 const ROBOT: &str = "{robot}";
@@ -38,9 +38,15 @@ impl Link {
     /// only if the link names nothing after it.
     #[must_use]
     pub fn of(&self, robot: &str) -> String {
-        // Host names have hyphens and dots.
-        const ENCODED: &percent_encoding::AsciiSet = &NON_ALPHANUMERIC.remove(b'-').remove(b'.');
-        let encoded = |name: &str| utf8_percent_encode(name, ENCODED).to_string();
+        // RFC 3986, 2.3: unreserved characters.
+        const HOST: &AsciiSet = &NON_ALPHANUMERIC
+            .remove(b'-')
+            .remove(b'.')
+            .remove(b'_')
+            .remove(b'~');
+        // RFC 3986, 3.3 and 3.4: a colon has no meaning in a path or query.
+        const PATH: &AsciiSet = &HOST.remove(b':');
+        let encoded = |name: &str| utf8_percent_encode(name, HOST).to_string();
         let (scheme, rest) = self.0.split_once("://").unwrap_or(("http", &self.0));
         let end = rest.find(['/', '?', '#']).unwrap_or(rest.len());
         let (authority, path) = rest.split_at(end);
@@ -56,7 +62,7 @@ impl Link {
         }
         format!(
             "{scheme}://{authority}{}",
-            path.replace(ROBOT, &encoded(robot))
+            path.replace(ROBOT, &utf8_percent_encode(robot, PATH).to_string())
         )
     }
 }
@@ -95,9 +101,10 @@ mod tests {
             (&own_port, "r-2:17400", "http://r-2:17401/"),
             (&own_port, "[fd00::7]:17400", "http://[fd00::7]:17401/"),
             (&own_port, "10.0.0.7", "http://10.0.0.7:17401/"),
-            (&domain, "r-2:17400", "http://r-2.example/?to=r-2%3A17400"),
+            (&domain, "r-2:17400", "http://r-2.example/?to=r-2:17400"),
             (&whole, "r-2:17400", "http://r-2:17400/page"),
             (&whole, "a:b", "http://a%3Ab/page"),
+            (&whole, "robot_7", "http://robot_7/page"),
             (&whole, "evil@a:1", "http://evil%40a:1/page"),
             (&whole, "[x]:1", "http://%5Bx%5D:1/page"),
         ] {
