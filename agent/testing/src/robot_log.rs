@@ -1,6 +1,13 @@
 //! Messages of a node's log, encoded by hand after `rcl_interfaces/msg/Log`, as XCDR1 in
 //! little-endian order.
 
+use std::path::Path;
+
+use ros2probe_wire::{EntityId, Guid, GuidPrefix};
+
+use crate::model::capture::{Capture, ETHERNET};
+use crate::model::forge::{self, Message, SEDP_WRITERS};
+
 /// DDS name of the type.
 pub const DDS_TYPE: &str = "rcl_interfaces::msg::dds_::Log_";
 
@@ -22,6 +29,28 @@ pub fn log(level: u8, logger: &str, text: &[u8]) -> Vec<u8> {
     align(&mut bytes);
     bytes.extend(81_u32.to_le_bytes());
     bytes
+}
+
+/// Writes a capture of a node that logs a message each millisecond: level, name of the logger, and
+/// text. Returns its writer of `/rosout`; the messages have the sequence numbers from 1 on.
+pub fn write_capture(
+    path: &Path,
+    messages: impl IntoIterator<Item = (u8, String, String)>,
+) -> Guid {
+    let writer = Guid::new(GuidPrefix([3; 12]), EntityId([0, 0, 1, 3]));
+    let start = 1_700_000_000_000_000_000;
+    let mut capture = Capture::new(ETHERNET);
+    capture.participant(start, 0, writer.prefix);
+    let payload = forge::endpoint(writer, "rt/rosout", DDS_TYPE, true);
+    let message = Message::from(writer.prefix).data(SEDP_WRITERS, 1, &payload);
+    capture.put(start + 1_000, 0, message);
+    for (number, (level, logger, text)) in (1_u64..).zip(messages) {
+        let payload = log(level, &logger, text.as_bytes());
+        let message = Message::from(writer.prefix).data(writer.entity, number, &payload);
+        capture.put(start + 1_000_000 * number, 0, message);
+    }
+    capture.write(path);
+    writer
 }
 
 pub(crate) fn align(bytes: &mut Vec<u8>) {

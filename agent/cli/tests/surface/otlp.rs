@@ -16,13 +16,11 @@ use opentelemetry_proto::tonic::collector::metrics::v1::{
 use ros2probe_metrics::catalogue::{CATALOGUE, Kind};
 use ros2probe_model::derive::trace::Message as TraceMessage;
 use ros2probe_testing::local_agent::{self, LocalAgent, metric};
-use ros2probe_testing::model::capture::{Capture, ETHERNET};
-use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS};
 use ros2probe_testing::ports::free_address;
 use ros2probe_testing::repository;
 use ros2probe_testing::robot_log;
 use ros2probe_testing::rotel::{Export, Item, Rotel, exports};
-use ros2probe_wire::{EntityId, Guid, GuidPrefix, SequenceNumber};
+use ros2probe_wire::SequenceNumber;
 
 /// Returns whether the value of a metric changes between two readings.
 pub(crate) fn changes(name: &str) -> bool {
@@ -303,22 +301,12 @@ fn the_log_of_the_agent_is_exported_if_enabled_and_exports_add_no_lines_to_it() 
 #[test]
 fn logs_of_nodes_are_exported_from_a_level_on_with_location_and_trace() {
     let directory = tempfile::tempdir().unwrap();
-    let prefix = GuidPrefix([3; 12]);
-    let writer = Guid::new(prefix, EntityId([0, 0, 1, 3]));
-    let start = 1_700_000_000_000_000_000;
-    let mut capture = Capture::new(ETHERNET);
-    capture.participant(start, 0, prefix);
-    let payload = forge::endpoint(writer, "rt/rosout", robot_log::DDS_TYPE, true);
-    let message = Message::from(prefix).data(SEDP_WRITERS, 1, &payload);
-    capture.put(start + 1_000, 0, message);
-    for (number, level) in (1_u64..).zip([20, 30, 40]) {
-        let text = format!("message {level}");
-        let payload = robot_log::log(level, "robot1.lidar", text.as_bytes());
-        let message = Message::from(prefix).data(writer.entity, number, &payload);
-        capture.put(start + 1_000_000 * number, 0, message);
-    }
     let pcap = directory.path().join("robot.pcap");
-    capture.write(&pcap);
+    let messages = [20, 30, 40].map(|level| {
+        let text = format!("message {level}");
+        (level, "robot1.lidar".to_owned(), text)
+    });
+    let writer = robot_log::write_capture(&pcap, messages);
     let mut receiver = Rotel::start(&mut Command::new(Rotel::binary()), directory.path(), None);
     let configuration = directory.path().join("ros2probe.yaml");
     let yaml = format!(

@@ -21,10 +21,7 @@ use opentelemetry_proto::tonic::collector::logs::v1::{
 use opentelemetry_proto::tonic::common::v1::any_value::Value;
 use prost::Message as _;
 use ros2probe_testing::local_agent::LocalAgent;
-use ros2probe_testing::model::capture::{Capture, ETHERNET};
-use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS};
 use ros2probe_testing::robot_log;
-use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpListener, TcpStream};
 use tonic::codegen::Service as _;
@@ -227,24 +224,13 @@ async fn relay(near: TcpStream, target: SocketAddr, bytes_per_s: usize) {
 
 /// Writes a capture with this number of log messages of a node. One has a long text.
 fn capture(path: &Path, count: usize) {
-    let prefix = GuidPrefix([3; 12]);
-    let writer = Guid::new(prefix, EntityId([0, 0, 1, 3]));
-    let start = 1_700_000_000_000_000_000;
-    let mut capture = Capture::new(ETHERNET);
-    capture.participant(start, 0, prefix);
-    let payload = forge::endpoint(writer, "rt/rosout", robot_log::DDS_TYPE, true);
-    let message = Message::from(prefix).data(SEDP_WRITERS, 1, &payload);
-    capture.put(start + 1_000, 0, message);
-    for number in 0..count {
+    let messages = (0..count).map(|number| {
         // Names and texts of logs are kept up to 128 and 512 bytes.
         let (name, length) = if number == LONG { (110, 490) } else { (5, 0) };
         let text = format!("message {number} {}", "x".repeat(length));
-        let logger = format!("robot1.{}", "l".repeat(name));
-        let payload = robot_log::log(40, &logger, text.as_bytes());
-        let message = Message::from(prefix).data(writer.entity, number as u64 + 1, &payload);
-        capture.put(start + 1_000_000 * (number as u64 + 1), 0, message);
-    }
-    capture.write(path);
+        (40, format!("robot1.{}", "l".repeat(name)), text)
+    });
+    robot_log::write_capture(path, messages);
 }
 
 fn agent(directory: &Path, address: SocketAddr, options: &str, capture: &Path) -> LocalAgent {
