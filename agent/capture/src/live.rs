@@ -34,6 +34,7 @@ use super::shm::poll_interval::Budget as Shares;
 use super::shm::{self, SharedMemory};
 use super::streams::Streams;
 use super::system::{Clocks, give_back_memory, wait};
+use super::tcx;
 use super::threads::Spawn;
 use super::uprobe::Uprobe;
 use super::uprobe::search::Facts as UprobeFacts;
@@ -204,13 +205,17 @@ pub struct DropCount {
 
 /// Returns what a unit of systemd needs to observe interfaces instead; an empty text elsewhere.
 fn instead() -> String {
-    match is_service() && !is_container() {
-        true => format!(
-            "; to observe interfaces instead, the unit needs `CapabilityBoundingSet=CAP_NET_RAW`, \
-             `AmbientCapabilities=CAP_NET_RAW` and `{FAMILIES_LINE}` (`systemctl edit`)"
-        ),
-        false => String::new(),
+    if !is_service() || is_container() {
+        return String::new();
     }
+    let rights = match tcx::check() {
+        Ok(()) => "",
+        Err(_) => "`CapabilityBoundingSet=CAP_NET_RAW`, `AmbientCapabilities=CAP_NET_RAW` and ",
+    };
+    format!(
+        "; to observe interfaces instead, the unit needs {rights}`{FAMILIES_LINE}` \
+         (`systemctl edit`)"
+    )
 }
 
 /// Adds why the host hook is unavailable, if packet sockets are not permitted either.

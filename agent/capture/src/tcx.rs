@@ -22,11 +22,14 @@ use super::filter::FilterError;
 use super::netns::{self, NetnsError};
 use crate::tables::KnownInterfaces;
 use crate::threads::{Spawn, Task};
+use crate::tracepoints::release;
 
 /// Attach types of linux/bpf.h.
 pub const BPF_TCX_INGRESS: u32 = 46;
 /// As [`BPF_TCX_INGRESS`], for sent packets.
 pub const BPF_TCX_EGRESS: u32 = 47;
+/// The first Linux with tcx.
+const FIRST_RELEASE: (u32, u32) = (6, 6);
 /// Index of the loopback interface in every network namespace.
 const LOOPBACK: u32 = 1;
 
@@ -79,6 +82,17 @@ pub fn check() -> Result<(), TcxError> {
             Some(libc::EPERM | libc::EACCES) => TcxError::NetAdmin,
             _ => TcxError::Query(error),
         }),
+    }
+}
+
+/// Returns whether this kernel has tcx. Without `CAP_NET_ADMIN` the kernel does not answer; its
+/// release then decides.
+#[must_use]
+pub fn is_supported() -> bool {
+    match check() {
+        Ok(()) => true,
+        Err(TcxError::NetAdmin) => release().is_some_and(|release| release >= FIRST_RELEASE),
+        Err(_) => false,
     }
 }
 

@@ -170,9 +170,12 @@ fn a_service_without_any_source_ends_with_the_missing_lines(host: &Debian) -> Re
     host.text("systemctl restart ros2probe")?;
     prints(host, EXIT, "77")?;
     let log = host.run("journalctl --unit ros2probe --no-pager --output cat")?;
-    let lines =
-        "; to observe interfaces instead, the unit needs `CapabilityBoundingSet=CAP_NET_RAW`";
-    ensure!(log.contains(lines), "{log}");
+    let line = match has_tcx()? {
+        true => "RestrictAddressFamilies=",
+        false => "CapabilityBoundingSet=CAP_NET_RAW",
+    };
+    let lines = format!("; to observe interfaces instead, the unit needs `{line}");
+    ensure!(log.contains(&lines), "{log}");
     host.run(&format!(
         "cp --preserve /srv/before.yaml {CONFIG}; rm /srv/before.yaml; \
          systemctl restart ros2probe"

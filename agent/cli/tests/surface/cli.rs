@@ -9,6 +9,7 @@ use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
 use crate::rp;
+use ros2probe_capture::tcx;
 use ros2probe_testing::local_agent::{LocalAgent, PATIENCE, capture, metric, promtool};
 
 fn run(arguments: &[&str]) -> Output {
@@ -136,6 +137,11 @@ fn without_privileges_the_error_has_the_missing_capabilities_and_the_command() {
         .output()
         .unwrap();
     let program = program.to_str().unwrap();
+    if tcx::is_supported() {
+        let grant = format!("sudo setcap cap_net_admin,cap_bpf,cap_perfmon+ep {program}");
+        let either = "CAP_NET_ADMIN, CAP_BPF, CAP_PERFMON for the source `host` or `wire`";
+        return fails_with(&output, 77, &[either, &grant]);
+    }
     let grant = format!("sudo setcap cap_net_admin,cap_bpf,cap_perfmon,cap_net_raw+ep {program}");
     let host = "CAP_NET_ADMIN, CAP_BPF, CAP_PERFMON for the source `host`";
     let wire = "CAP_NET_RAW, CAP_BPF, CAP_PERFMON for the source `wire`";

@@ -96,24 +96,35 @@ pub fn check(settings: &CaptureSettings) -> Result<(), Missing> {
     let Ok(effective) = raise() else {
         return Ok(());
     };
-    let Some(missing_for_packets) = missing(effective, settings) else {
-        return Ok(());
-    };
-    let with_tcx = CaptureSettings {
+    missing(effective, settings).map_or(Ok(()), Err)
+}
+
+/// Returns the capabilities that a process with the `effective` ones lacks; `None` if it has all. If
+/// the agent selects how to observe interfaces, those for packet sockets suffice. The result names
+/// those for tcx where the kernel has it.
+#[must_use]
+pub fn missing(effective: CapabilitySet, settings: &CaptureSettings) -> Option<Missing> {
+    missing_on(effective, settings, tcx::is_supported())
+}
+
+fn missing_on(
+    effective: CapabilitySet,
+    settings: &CaptureSettings,
+    has_tcx: bool,
+) -> Option<Missing> {
+    let missing = missing_for(effective, settings)?;
+    if settings.wire != WireChoice::Auto || !has_tcx {
+        return Some(missing);
+    }
+    let at_tcx = CaptureSettings {
         wire: WireChoice::Tcx,
         ..settings.clone()
     };
-    let may_use_tcx = settings.wire == WireChoice::Auto && tcx::check().is_ok();
-    match may_use_tcx && missing(effective, &with_tcx).is_none() {
-        true => Ok(()),
-        false => Err(missing_for_packets),
-    }
+    missing_for(effective, &at_tcx)
 }
 
-/// Returns the capabilities that a process with the `effective` ones lacks; `None` if it has all. For
-/// interfaces, packet sockets count, unless the configuration requires tcx.
-#[must_use]
-pub fn missing(effective: CapabilitySet, settings: &CaptureSettings) -> Option<Missing> {
+/// Returns the missing capabilities, with packet sockets at interfaces unless `settings` require tcx.
+fn missing_for(effective: CapabilitySet, settings: &CaptureSettings) -> Option<Missing> {
     // `CAP_SYS_ADMIN`, which is older and wider, includes its successors.
     let inherited = match effective.contains(CapabilitySet::SYS_ADMIN) {
         true => CapabilitySet::BPF | CapabilitySet::PERFMON,
@@ -232,16 +243,21 @@ impl Missing {
     /// Returns a text about the capabilities that each source lacks.
     #[must_use]
     pub fn missing_text(&self) -> String {
-        let needs: Vec<String> = self
-            .sources
-            .iter()
-            .map(|(source, lacking)| {
-                let names = lacking.iter().copied().flat_map(capability_names);
-                let names: Vec<_> = names.collect();
-                format!("{} for the source `{}`", names.join(", "), source.label())
-            })
-            .collect();
-        needs.join(", or ")
+        let text = |lacking: &[CapabilitySet]| {
+            let names = lacking.iter().copied().flat_map(capability_names);
+            names.collect::<Vec<_>>().join(", ")
+        };
+        if let [(one, lacking), (other, same)] = self.sources.as_slice()
+            && lacking == same
+        {
+            let (lacking, one, other) = (text(lacking), one.label(), other.label());
+            return format!("{lacking} for the source `{one}` or `{other}`");
+        }
+        let needs = self.sources.iter();
+        let needs = needs.map(|(source, lacking)| {
+            format!("{} for the source `{}`", text(lacking), source.label())
+        });
+        needs.collect::<Vec<_>>().join(", or ")
     }
 
     /// Returns the command that grants the capabilities to this program.
@@ -346,6 +362,11 @@ mod tests {
         }
     }
 
+    /// Returns what is missing on a kernel without tcx.
+    fn missing(effective: CapabilitySet, settings: &CaptureSettings) -> Option<Missing> {
+        missing_on(effective, settings, false)
+    }
+
     fn lacks(has: &[CapabilitySet], settings: &CaptureSettings) -> Vec<Vec<CapabilitySet>> {
         let missing = missing(set(has), settings);
         let sources = missing.map_or_else(Vec::new, |missing| missing.sources);
@@ -431,6 +452,42 @@ mod tests {
     }
 
     #[test]
+    fn where_the_kernel_has_tcx_no_error_names_the_capability_of_packet_sockets() {
+        let lacks = |has: &[CapabilitySet], settings: &CaptureSettings| {
+            missing_on(set(has), settings, true)
+        };
+        let auto = settings(SourceChoice::Auto);
+        let wire = settings(SourceChoice::Wire);
+        let missing = lacks(&HOST_CAPABILITIES[1..], &auto).unwrap();
+        assert_eq!(
+            missing.missing_text(),
+            "CAP_NET_ADMIN for the source `host` or `wire`"
+        );
+        assert!(
+            missing
+                .command()
+                .contains("cap_net_admin,cap_bpf,cap_perfmon+ep "),
+            "{}",
+            missing.command()
+        );
+        let missing = lacks(&[CapabilitySet::BPF], &wire).unwrap();
+        assert_eq!(
+            missing.missing_text(),
+            "CAP_NET_ADMIN, CAP_PERFMON for the source `wire`"
+        );
+        // Either of the two ways suffices.
+        for has in [HOST_CAPABILITIES, WIRE_CAPABILITIES] {
+            assert_eq!(lacks(&has, &wire), None);
+        }
+        let packets = CaptureSettings {
+            wire: WireChoice::Packet,
+            ..wire
+        };
+        let missing = lacks(&HOST_CAPABILITIES, &packets).unwrap();
+        assert_eq!(missing.missing_text(), "CAP_NET_RAW for the source `wire`");
+    }
+
+    #[test]
     fn in_a_container_the_error_is_one_option_of_its_engine() {
         let has = |capabilities| missing(set(capabilities), &settings(SourceChoice::Auto)).unwrap();
         let bpf = has(&[CapabilitySet::NET_ADMIN, CapabilitySet::PERFMON]);
@@ -465,7 +522,7 @@ mod tests {
              `CapabilityBoundingSet=CAP_NET_ADMIN CAP_BPF CAP_PERFMON` (`systemctl edit`)"
         );
         let missing =
-            super::missing(set(&WIRE_CAPABILITIES[1..]), &settings(SourceChoice::Wire)).unwrap();
+            self::missing(set(&WIRE_CAPABILITIES[1..]), &settings(SourceChoice::Wire)).unwrap();
         assert_eq!(
             missing.in_unit(),
             "live capture needs CAP_NET_RAW for the source `wire`: the unit needs \
