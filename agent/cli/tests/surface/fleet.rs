@@ -109,7 +109,10 @@ fn an_answer_beyond_the_cap_is_refused() {
     });
     let (code, text) = fleet(&["--engine", &format!("http://{endless}")]);
     assert_eq!(code, Some(1));
-    assert!(text.contains("cannot receive the answer"), "{text}");
+    assert!(
+        text.contains("the answer is longer than 67108864 bytes"),
+        "{text}"
+    );
 }
 
 #[test]
@@ -398,7 +401,29 @@ fn an_agent_refuses_an_answer_beyond_the_cap() {
     let agent = agent(directory.path(), &yaml);
     let answer = fleet_of(&agent, |answer| answer["problem"].is_string());
     let problem = answer["problem"].as_str().unwrap();
-    assert!(problem.contains("cannot receive the answer"), "{problem}");
+    assert!(problem.contains("longer than 4194304 bytes"), "{problem}");
+}
+
+#[test]
+fn an_agent_refuses_answers_with_series_beyond_the_cap_in_all() {
+    let directory = tempfile::tempdir().unwrap();
+    // Each answer alone is below both caps.
+    let many = engine(|out| {
+        let series = vec![r#"{"metric":{},"value":[0,"0"]}"#; (4 << 20) / 40 / 2 + 1].join(",");
+        let text = format!(
+            r#"{{"status":"success","data":{{"resultType":"vector","result":[{series}]}}}}"#
+        );
+        write!(
+            out,
+            "HTTP/1.1 200 OK\r\nContent-Length: {}\r\n\r\n{text}",
+            text.len()
+        )
+    });
+    let yaml = format!("fleet: {{engine: 'http://{many}'}}\n");
+    let agent = agent(directory.path(), &yaml);
+    let answer = fleet_of(&agent, |answer| answer["problem"].is_string());
+    let problem = answer["problem"].as_str().unwrap();
+    assert!(problem.contains("more than 104857 series"), "{problem}");
 }
 
 #[test]

@@ -6,7 +6,7 @@ use std::str::FromStr;
 use std::time::Duration;
 
 use bytes::Bytes;
-use http_body_util::{BodyExt as _, Full, Limited};
+use http_body_util::{BodyExt as _, Full, LengthLimitError, Limited};
 use hyper::header::{AUTHORIZATION, CONTENT_TYPE, HeaderValue, USER_AGENT};
 use hyper::{Request, StatusCode, Uri};
 use hyper_rustls::{HttpsConnector, HttpsConnectorBuilder};
@@ -15,16 +15,30 @@ use hyper_util::client::legacy::{Client, ResponseFuture};
 use hyper_util::rt::TokioExecutor;
 use percent_encoding::{NON_ALPHANUMERIC, utf8_percent_encode};
 use serde::Deserialize;
-use std::collections::BTreeMap;
 use tokio::time::timeout;
 
 /// Maximum wait for an answer.
 const TIMEOUT: Duration = Duration::from_secs(30);
 /// Maximum length of an answer for a command, in bytes.
 pub const MAX_BYTES: usize = 64 << 20;
+/// All answers of a reading have at most one series for this many bytes of the longest answer: the
+/// shortest series need 30 bytes there, and several hundred in memory.
+const BYTES_PER_SERIES: usize = 40;
 
-/// Labels of a series without its name.
-pub(super) type Labels = BTreeMap<String, String>;
+/// Labels of a series that are read. Those that it does not have are empty, as in PromQL.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Deserialize)]
+#[serde(default)]
+pub(super) struct Labels {
+    pub instance: String,
+    pub version: String,
+    pub ros_node: String,
+    pub topic: String,
+    pub message_type: String,
+    pub reliability: String,
+    pub durability: String,
+    pub expectation: String,
+    pub kind: String,
+}
 
 /// A connection to an engine.
 #[derive(Debug)]
@@ -64,9 +78,15 @@ pub enum EngineError {
     /// The engine cannot be reached.
     #[error("the connection failed")]
     Connection(#[source] hyper_util::client::legacy::Error),
-    /// The answer broke off, or is too long.
+    /// The answer broke off.
     #[error("cannot receive the answer")]
     Body(#[source] Box<dyn Error + Send + Sync>),
+    /// The answer has more bytes than this.
+    #[error("the answer is longer than {0} bytes")]
+    TooLong(usize),
+    /// The answers have more series than this.
+    #[error("the answers have more than {0} series in all")]
+    TooMany(usize),
     /// The answer took too long.
     #[error("no answer within {} s", TIMEOUT.as_secs())]
     Slow,
@@ -155,12 +175,21 @@ impl Engine {
         })
     }
 
-    /// Returns the current value of each series of an expression.
+    /// Returns the maximum number of series in all answers of a reading.
+    pub(super) const fn max_series(&self) -> usize {
+        self.max_bytes / BYTES_PER_SERIES
+    }
+
+    /// Returns the current value of each series of an expression, and takes their number from `left`.
     ///
     /// # Errors
     ///
-    /// Fails if the engine cannot be reached, or refuses the query.
-    pub(super) async fn query(&self, expression: &str) -> Result<Vec<(Labels, f64)>, EngineError> {
+    /// Fails if the engine cannot be reached, if it refuses the query, or if its answer is too large.
+    pub(super) async fn query(
+        &self,
+        expression: &str,
+        left: &mut usize,
+    ) -> Result<Vec<(Labels, f64)>, EngineError> {
         let encoded = utf8_percent_encode(expression, NON_ALPHANUMERIC);
         let mut request = Request::new(Full::new(Bytes::from(format!("query={encoded}"))));
         *request.method_mut() = hyper::Method::POST;
@@ -180,7 +209,11 @@ impl Engine {
             let body = Limited::new(answer.into_body(), self.max_bytes)
                 .collect()
                 .await;
-            let body = body.map_err(EngineError::Body)?.to_bytes();
+            let body = body.map_err(|error| match error.is::<LengthLimitError>() {
+                true => EngineError::TooLong(self.max_bytes),
+                false => EngineError::Body(error),
+            });
+            let body = body?.to_bytes();
             if status.is_success() {
                 return Ok(body);
             }
@@ -189,7 +222,10 @@ impl Engine {
             Err(EngineError::Status(status, text))
         };
         let answered = timeout(TIMEOUT, answered).await;
-        read(&answered.unwrap_or(Err(EngineError::Slow))?)
+        let samples = read(&answered.unwrap_or(Err(EngineError::Slow))?)?;
+        let rest = left.checked_sub(samples.len());
+        *left = rest.ok_or(EngineError::TooMany(self.max_series()))?;
+        Ok(samples)
     }
 }
 
@@ -246,13 +282,14 @@ mod tests {
     #[test]
     fn only_results_of_queries_are_read() {
         let body = r#"{"status":"success","data":{"resultType":"vector","result":[
-            {"metric":{"instance":"a"},"value":[1.5,"2"]},
+            {"metric":{"instance":"a","site":"b"},"value":[1.5,"2"]},
             {"metric":{},"value":[1.5,"NaN"]}]}}"#;
         let samples = read(body.as_bytes()).unwrap();
-        assert_eq!(
-            samples[0],
-            (Labels::from([("instance".into(), "a".into())]), 2.0)
-        );
+        let labels = Labels {
+            instance: "a".to_owned(),
+            ..Labels::default()
+        };
+        assert_eq!(samples[0], (labels, 2.0));
         assert!(samples[1].1.is_nan());
         assert!(read(b"<html>").is_err());
         assert!(read(br#"{"data":{"resultType":"matrix","result":[]}}"#).is_err());

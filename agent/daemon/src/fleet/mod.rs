@@ -28,8 +28,8 @@ pub use robot::{Question, read};
 
 /// Maximum size of the file with a token, in bytes.
 pub const TOKEN_BYTES: u64 = 64 << 10;
-/// Maximum length of an answer of an engine to an agent, in bytes. Eleven of them are in memory while
-/// clients ask, and what they mean, which takes several times that for thousands of series.
+/// Maximum length of an answer of an engine to an agent, in bytes. While clients ask, memory holds
+/// the labels of eleven of them, and of each series what it means. The engine bounds their number.
 const AGENT_ANSWER_BYTES: usize = 4 << 20;
 
 /// Why the view of a fleet cannot start.

@@ -86,9 +86,10 @@ pub async fn read(engine: &Engine, question: &Question) -> Result<Fleet, EngineE
 impl Answers {
     async fn query(engine: &Engine, question: &Question) -> Result<Self, EngineError> {
         let job = format!("job={}", quoted(&question.job));
-        let ask = async |expression: &str| {
+        let mut left = engine.max_series();
+        let mut ask = async |expression: &str| {
             let expression = expression.replace("$JOB", &job);
-            Ok::<_, EngineError>(by_robot(engine.query(&expression).await?))
+            Ok::<_, EngineError>(by_robot(engine.query(&expression, &mut left).await?))
         };
         let hours = question.hours;
         Ok(Self {
@@ -128,17 +129,20 @@ impl Answers {
             }
         };
         for (labels, _) in of(&self.versions, name) {
-            text("version of the agent".to_owned(), label(labels, "version"));
+            text("version of the agent".to_owned(), labels.version.clone());
         }
         for (labels, _) in of(&self.nodes, name) {
-            let node = common(labels, "ros_node", name);
+            let node = common(&labels.ros_node, name);
             text(format!("node {node}"), PRESENT.to_owned());
         }
         for (labels, _) in of(&self.topics, name) {
-            let topic = common(labels, "topic", name);
-            for quality in ["message_type", "reliability", "durability"] {
-                let key = format!("{} of {topic}", quality.replace('_', " "));
-                text(key, label(labels, quality));
+            let topic = common(&labels.topic, name);
+            for (quality, value) in [
+                ("message type", &labels.message_type),
+                ("reliability", &labels.reliability),
+                ("durability", &labels.durability),
+            ] {
+                text(format!("{quality} of {topic}"), value.clone());
             }
         }
         for (what, counts) in [
@@ -147,15 +151,15 @@ impl Answers {
         ] {
             let mut sums = BTreeMap::<String, f64>::new();
             for (labels, count) in of(counts, name) {
-                *sums.entry(common(labels, "topic", name)).or_default() += count;
+                *sums.entry(common(&labels.topic, name)).or_default() += count;
             }
             for (topic, count) in sums {
                 text(format!("{what} of {topic}"), format!("{count}"));
             }
         }
         for (labels, count) in of(&self.findings, name) {
-            let kind = label(labels, "kind");
-            if is_usual(&kind) {
+            let kind = &labels.kind;
+            if is_usual(kind) {
                 text(format!("endpoints with {kind}"), format!("{count}"));
             }
         }
@@ -165,7 +169,7 @@ impl Answers {
             .map(|(key, texts)| (key, Trait::Text(joined(texts))));
         let mut traits: BTreeMap<_, _> = texts.collect();
         for (labels, rate) in of(&self.rates, name) {
-            let key = format!("rate of {}", common(labels, "topic", name));
+            let key = format!("rate of {}", common(&labels.topic, name));
             let sum = traits.entry(key).or_insert(Trait::Hertz(0.0));
             if let Trait::Hertz(sum) = sum {
                 *sum += rate;
@@ -182,17 +186,17 @@ impl Answers {
     fn robot(&self, name: &str, reach: f64, differences: Vec<Difference>) -> Robot {
         let violated = of(&self.violated, name).iter();
         let violated =
-            violated.map(|(labels, _)| (label(labels, "topic"), label(labels, "expectation")));
+            violated.map(|(labels, _)| (labels.topic.clone(), labels.expectation.clone()));
         let findings = of(&self.findings, name)
             .iter()
-            .map(|(labels, count)| (label(labels, "kind"), *count as u64))
+            .map(|(labels, count)| (labels.kind.clone(), *count as u64))
             .filter(|(kind, _)| !is_usual(kind));
         let version = of(&self.versions, name).first();
         let mut robot = Robot {
             name: name.to_owned(),
             state: State::OutOfReach,
             age_s: value(of(&self.ages, name)).unwrap_or(0.0).max(0.0),
-            version: version.map(|(labels, _)| label(labels, "version")),
+            version: version.map(|(labels, _)| labels.version.clone()),
             nodes: of(&self.nodes, name).len(),
             topics: of(&self.topics, name).len(),
             loss: value(of(&self.losses, name)).filter(|loss| loss.is_finite()),
@@ -230,11 +234,9 @@ fn is_usual(kind: &str) -> bool {
 fn by_robot(samples: Samples) -> ByRobot<Samples> {
     let mut robots: ByRobot<Samples> = BTreeMap::new();
     for (labels, value) in samples {
-        if let Some(robot) = labels.get("instance") {
-            robots
-                .entry(robot.clone())
-                .or_default()
-                .push((labels, value));
+        if !labels.instance.is_empty() {
+            let robot = robots.entry(labels.instance.clone()).or_default();
+            robot.push((labels, value));
         }
     }
     robots
@@ -248,15 +250,10 @@ fn value(samples: &[(Labels, f64)]) -> Option<f64> {
     samples.first().map(|(_, value)| *value)
 }
 
-fn label(labels: &Labels, name: &str) -> String {
-    labels.get(name).cloned().unwrap_or_default()
-}
-
 /// Returns a name as it is on every robot: the robot's own name in it is `<robot>`, and a number of
 /// three or more digits, as of a process, is `<number>`.
-fn common(labels: &Labels, name: &str, robot: &str) -> String {
-    let text = label(labels, name);
-    let tokens = text.split('/').map(|token| {
+fn common(name: &str, robot: &str) -> String {
+    let tokens = name.split('/').map(|token| {
         if token == robot || token == robot.replace(['-', '.'], "_") {
             "<robot>".to_owned()
         } else {
@@ -285,10 +282,7 @@ mod tests {
 
     #[test]
     fn names_of_a_robot_and_of_a_process_are_the_same_on_every_robot() {
-        let common = |name: &str| {
-            let labels = Labels::from([("topic".to_owned(), name.to_owned())]);
-            super::common(&labels, "topic", "robot-7")
-        };
+        let common = |name: &str| super::common(name, "robot-7");
         assert_eq!(common("/robot_7/scan"), "/<robot>/scan");
         assert_eq!(common("/robot-7"), "/<robot>");
         assert_eq!(common("/launch_ros_4711"), "/launch_ros_<number>");
@@ -298,9 +292,10 @@ mod tests {
 
     #[test]
     fn traits_of_topics_with_one_key_do_not_depend_on_the_order_of_the_answer() {
-        let labels = |topic: &str, reliability: &str| {
-            let labels = [("topic", topic), ("reliability", reliability)];
-            Labels::from(labels.map(|(name, value)| (name.to_owned(), value.to_owned())))
+        let labels = |topic: &str, reliability: &str| Labels {
+            topic: topic.to_owned(),
+            reliability: reliability.to_owned(),
+            ..Labels::default()
         };
         let mut series = vec![
             (labels("/camera_001/image", "reliable"), 30.0),
