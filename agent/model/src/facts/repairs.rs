@@ -1,8 +1,9 @@
-//! Messages that a receiver missed at first, and that arrived by a retransmission.
+//! Messages that a receiver missed at first, until they arrived by a retransmission or their writer
+//! gave them up.
 //!
 //! A reliable reader passes messages on in the order of their sequence numbers. So the later messages of
-//! the same writer wait until the missed one has arrived (RTPS 2.5, 8.4.10.4). A message that a later
-//! one overtook counts as a retransmission.
+//! the same writer wait until the missed one has arrived (RTPS 2.5, 8.4.10.4), or until a GAP declares
+//! it irrelevant (8.3.8.4). A message that a later one overtook counts as a retransmission.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -21,17 +22,19 @@ const ROUNDING: u64 = 1;
 /// Time for which a retransmission is remembered. Late calls are reported once a second.
 const LIFETIME: Duration = Duration::from_secs(5);
 
-/// The latest retransmissions that reached receivers on this host.
+/// The latest retransmissions, and GAPs in their place, that reached receivers on this host.
 #[derive(Debug, Default)]
 pub struct RepairLog(Bounded<Retransmissions, VecDeque<Repaired>>);
 
-/// A message that arrived by a retransmission.
+/// A message that arrived by a retransmission, or that its writer gave up.
 #[derive(Clone, Copy, Debug)]
 struct Repaired {
     writer: Guid,
     receiver: GuidPrefix,
+    /// Source timestamp of the message, or a time between those of its neighbours.
     source: Timestamp,
     arrived: ModelTime,
+    is_message: bool,
 }
 
 /// The message of a call, and when the call began and became ready.
@@ -53,18 +56,32 @@ impl RepairLog {
         source: RtpsTime,
         arrived: ModelTime,
     ) {
-        let is_old = |first: &Repaired| arrived - first.arrived > LIFETIME;
-        while self.0.front().is_some_and(is_old) {
-            self.0.pop_front();
-        }
         if let Some(source) = source.timestamp() {
-            self.0.push_back(Repaired {
+            self.add(Repaired {
                 writer,
                 receiver,
                 source,
                 arrived,
+                is_message: true,
             });
         }
+    }
+
+    /// Notes a GAP of `writer` for a message that the participant `receiver` missed. `source` is a time
+    /// between those of the messages before and after it.
+    pub fn push_gap(
+        &mut self,
+        (writer, receiver): (Guid, GuidPrefix),
+        source: Timestamp,
+        arrived: ModelTime,
+    ) {
+        self.add(Repaired {
+            writer,
+            receiver,
+            source,
+            arrived,
+            is_message: false,
+        });
     }
 
     /// Returns the retransmissions for which a call waited: of its message, and of an earlier one.
@@ -78,14 +95,23 @@ impl RepairLog {
         });
         for repaired in during {
             let before = awaited.started - repaired.arrived;
-            if repaired.source.0.abs_diff(awaited.source.0) <= ROUNDING {
+            let is_near = repaired.source.0.abs_diff(awaited.source.0) <= ROUNDING;
+            if is_near && repaired.is_message {
                 found.of_message = Some(before);
-            } else if repaired.source < awaited.source {
+            } else if !is_near && repaired.source < awaited.source {
                 let latest = found.of_earlier.map_or(before, |known| known.min(before));
                 found.of_earlier = Some(latest);
             }
         }
         found
+    }
+
+    fn add(&mut self, repaired: Repaired) {
+        let is_old = |first: &Repaired| repaired.arrived - first.arrived > LIFETIME;
+        while self.0.front().is_some_and(is_old) {
+            self.0.pop_front();
+        }
+        self.0.push_back(repaired);
     }
 }
 
@@ -153,6 +179,26 @@ mod tests {
         let found = waited(110, 182, 72);
         assert_eq!(found.of_message, None);
         assert_eq!(found.of_earlier, Some(Duration::from_millis(2)));
+    }
+
+    #[test]
+    fn a_gap_releases_the_messages_after_it_and_none_before() {
+        let mut log = RepairLog::default();
+        log.push_gap(PAIR, source(105), at(180));
+        let waited = |message: u64| {
+            log.of(
+                Awaited {
+                    source: source(message),
+                    started: at(182),
+                    wait: Duration::from_millis(82),
+                },
+                |_, _| true,
+            )
+        };
+        assert_eq!(waited(110).of_earlier, Some(Duration::from_millis(2)));
+        for message in [100, 105] {
+            assert_eq!(waited(message), Repairs::default(), "{message}");
+        }
     }
 
     #[test]

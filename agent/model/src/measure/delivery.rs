@@ -14,7 +14,7 @@ mod withheld;
 use std::collections::{BTreeSet, VecDeque};
 use std::time::Duration;
 
-use ros2probe_wire::{Guid, GuidPrefix, RtpsTime, SequenceNumber};
+use ros2probe_wire::{Guid, GuidPrefix, RtpsTime, SequenceNumber, Timestamp};
 
 use crate::facts::bounded::Bounded;
 use crate::facts::journal::Journal;
@@ -340,9 +340,14 @@ impl Delivery {
         self.mark_unread_irrelevant(before);
     }
 
-    /// Records a GAP for this receiver.
+    /// Records a GAP for this receiver. The messages behind a missed one waited for it.
     pub fn gap(&mut self, gap: &Gap, context: &mut DeliveryContext<'_>) {
         self.note_seen(context.now);
+        if let Some(source) = self.source_around(gap)
+            && let Some(pair) = self.repaired_pair(context)
+        {
+            context.journal.repairs.push_gap(pair, source, context.now);
+        }
         let (reception, budget, mut accounting) = self.split(context);
         reception.gap(gap, budget, &mut |decision| accounting.take(decision));
     }
@@ -565,12 +570,33 @@ impl Delivery {
         }
     }
 
+    /// Returns a time between those of the samples before and after one that the GAP withdraws and
+    /// that the receiver misses. Returns `None` if it misses none of them.
+    fn source_around(&self, gap: &Gap) -> Option<Timestamp> {
+        if self.direction() != Direction::Received {
+            return None;
+        }
+        let sequence = self.reception.sequence();
+        let before_base = sequence.source_around(gap.start, gap.list.base);
+        before_base.or_else(|| {
+            let mut listed = gap.list.iter();
+            listed.find_map(|number| sequence.source_around(number, number.next()))
+        })
+    }
+
+    /// Returns the writer and the receiving participant, if the former sends samples again.
+    fn repaired_pair(&self, context: &DeliveryContext<'_>) -> Option<(Guid, GuidPrefix)> {
+        match self.receiver {
+            Receiver::Participant(receiver) if self.is_reliable(context) => {
+                Some((context.writer, receiver))
+            }
+            _ => None,
+        }
+    }
+
     /// Notes a retransmission of a message with this source timestamp.
     fn note_repair(&self, source: RtpsTime, context: &mut DeliveryContext<'_>) {
-        if let Receiver::Participant(receiver) = self.receiver
-            && self.is_reliable(context)
-        {
-            let pair = (context.writer, receiver);
+        if let Some(pair) = self.repaired_pair(context) {
             context.journal.repairs.push(pair, source, context.now);
         }
     }

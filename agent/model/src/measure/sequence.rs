@@ -48,6 +48,8 @@ const MAX_STALE: u32 = 1024;
 /// Maximum number of samples without a reader that are marked irrelevant. If a run skips more, it
 /// restarts the numbers.
 pub const MAX_IRRELEVANT_AT_START: u64 = 512;
+/// Minimum time between the source times of two samples of one writer.
+const MIN_SOURCE_STEP: Duration = Duration::from_micros(1);
 /// Number of steps per window in which settling advances.
 const SETTLING_STEPS: u32 = 16;
 
@@ -116,6 +118,8 @@ struct Gap {
     end: SequenceNumber,
     noticed: ModelTime,
     requested: bool,
+    /// A time between those of the samples before and after the run; zero if unknown.
+    source: Timestamp,
 }
 
 /// Relation of a sample's number to earlier ones.
@@ -273,25 +277,25 @@ impl Sequence {
     /// Returns the number of missing samples that may still arrive.
     #[must_use]
     pub fn undecided(&self) -> u64 {
-        let mut number = self.settled.max(self.floor());
-        let mut undecided = 0;
-        while number < self.next {
-            let first = number.0 % 64;
-            let bits = (self.next - number).min(64 - first);
-            let mask = (u64::MAX >> (64 - bits)) << first;
-            let decided = self.received.word(number) | self.irrelevant.word(number);
-            undecided += u64::from((!decided & mask).count_ones());
-            number += bits;
-        }
-        undecided
+        let words = self.undecided_in(SequenceNumber::ZERO, self.next);
+        words.map(|(_, bits)| u64::from(bits.count_ones())).sum()
+    }
+
+    /// Returns a time between those of the samples before and after the lowest number of
+    /// `start..end` that may still arrive. Returns `None` without such a number, or if it is unknown.
+    #[must_use]
+    pub fn source_around(&self, start: SequenceNumber, end: SequenceNumber) -> Option<Timestamp> {
+        let mut words = self.undecided_in(start, end);
+        let (first, bits) = words.find(|(_, bits)| *bits != 0)?;
+        let missing = SequenceNumber(first.0 - first.0 % 64 + u64::from(bits.trailing_zeros()));
+        let source = self.gap_at(missing)?.source;
+        (source.0 > 0).then_some(source)
     }
 
     /// Returns the time at which this number was detected as missing, if remembered.
     #[must_use]
     pub fn missed_since(&self, number: SequenceNumber) -> Option<ModelTime> {
-        let mut gaps = self.gaps.iter().rev();
-        let gap = gaps.find(|gap| gap.start <= number && number < gap.end);
-        gap.map(|gap| gap.noticed)
+        self.gap_at(number).map(|gap| gap.noticed)
     }
 
     /// Records that this number arrived by another route: here it counts neither as lost nor as
@@ -454,6 +458,35 @@ impl Sequence {
         self.checkpoints.clear();
     }
 
+    /// Returns the numbers of `start..end` that may still arrive, as bits at `number % 64`. Each word
+    /// comes with the lowest number that it covers.
+    fn undecided_in(
+        &self,
+        start: SequenceNumber,
+        end: SequenceNumber,
+    ) -> impl Iterator<Item = (SequenceNumber, u64)> {
+        let mut number = start.max(self.settled).max(self.floor());
+        let end = end.min(self.next);
+        std::iter::from_fn(move || {
+            if number >= end {
+                return None;
+            }
+            let first = number.0 % 64;
+            let bits = (end - number).min(64 - first);
+            let mask = (u64::MAX >> (64 - bits)) << first;
+            let decided = self.received.word(number) | self.irrelevant.word(number);
+            let word = (number, !decided & mask);
+            number += bits;
+            Some(word)
+        })
+    }
+
+    /// Returns the run of missing numbers that this one was in, if remembered.
+    fn gap_at(&self, number: SequenceNumber) -> Option<&Gap> {
+        let mut gaps = self.gaps.iter().rev();
+        gaps.find(|gap| gap.start <= number && number < gap.end)
+    }
+
     /// Returns the lowest number that is remembered.
     fn floor(&self) -> SequenceNumber {
         self.next.saturating_sub(self.received.len())
@@ -521,11 +554,18 @@ impl Sequence {
     }
 
     fn note_gap(&mut self, start: SequenceNumber, end: SequenceNumber, now: ModelTime) {
+        // The sample after the run may have revealed it.
+        let step = if self.newest >= end {
+            MIN_SOURCE_STEP
+        } else {
+            Duration::ZERO
+        };
         self.gaps.push_back(Gap {
             start,
             end,
             noticed: now,
             requested: false,
+            source: self.newest_source - step,
         });
     }
 
@@ -535,11 +575,7 @@ impl Sequence {
         repair_mode: RepairMode,
         now: ModelTime,
     ) -> bool {
-        let gap = self
-            .gaps
-            .iter()
-            .rev()
-            .find(|gap| gap.start <= number && number < gap.end);
+        let gap = self.gap_at(number);
         let late = |gap: &Gap| gap.requested || now - gap.noticed >= MAX_REORDERING;
         match repair_mode {
             RepairMode::BestEffort => false,

@@ -175,13 +175,13 @@ pub struct MessageDelivery {
     pub receiver: Option<WaitingStates>,
 }
 
-/// Retransmissions for which a call waited: times from the arrival to the start of the call.
+/// Repairs for which a call waited: times from the arrival to the start of the call.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Repairs {
     /// The message itself was lost at first.
     pub of_message: Option<Duration>,
     /// An earlier message of the same publisher was lost at first. The middleware kept the later ones
-    /// until it arrived.
+    /// until it arrived, or until the publisher gave it up (GAP).
     pub of_earlier: Option<Duration>,
 }
 
@@ -303,7 +303,7 @@ pub enum Cause {
     Send,
     /// The message was long on its way.
     Transit,
-    /// The message, or an earlier one of its publisher, was lost and sent again.
+    /// The message, or an earlier one of its publisher, was lost and sent again, or given up.
     Repaired,
     /// No thread received the message from its socket.
     Queue,
@@ -412,7 +412,9 @@ impl Cause {
                 None => "its publisher took long to send it".to_owned(),
             },
             Self::Transit => "the message was long on its way to the socket".to_owned(),
-            Self::Repaired => "the message or one before it was lost and sent again".to_owned(),
+            Self::Repaired => {
+                "the message or one before it was lost and sent again, or given up".to_owned()
+            }
             Self::Queue => "the message waited in the socket's receive buffer".to_owned(),
             Self::Middleware => "the middleware passed the message on late".to_owned(),
             Self::Unexplained => "the cause is unknown".to_owned(),

@@ -171,6 +171,34 @@ fn a_gap_marks_numbers_irrelevant_and_a_heartbeat_does_not() {
 }
 
 #[test]
+fn a_missing_number_has_a_source_time_between_those_of_its_neighbours() {
+    let mut bench = Bench::default();
+    for number in [1, 2, 5] {
+        bench.now = number * SECOND;
+        bench.receive_at(number, Some(number * SECOND));
+    }
+    bench.heartbeat(1, 6);
+    let around = |bench: &Bench, start, end| {
+        let (start, end) = (SequenceNumber(start), SequenceNumber(end));
+        let source = bench.sequence.source_around(start, end);
+        source.map(|source| source.0)
+    };
+    let of_3 = around(&bench, 1, 10).unwrap();
+    assert!(2 * SECOND < of_3 && of_3 < 5 * SECOND, "{of_3}");
+    // The HEARTBEAT revealed the number, so the last sample is the one before.
+    assert_eq!(around(&bench, 6, 7), Some(5 * SECOND));
+    assert_eq!(around(&bench, 5, 6), None);
+    bench.sequence.gap(
+        SequenceNumber(3),
+        SequenceNumber(5),
+        [].into_iter(),
+        ModelTime::from_nanoseconds(bench.now),
+        &mut |_| {},
+    );
+    assert_eq!(around(&bench, 1, 6), None);
+}
+
+#[test]
 fn acknowledged_samples_are_lost_only_if_the_writer_had_withdrawn_them() {
     let mut bench = Bench::default();
     bench.receive([1, 4]);

@@ -1,4 +1,4 @@
-//! Calls that are late because a message was lost and sent again.
+//! Calls that are late because a message was lost, and sent again or given up.
 
 use ros2probe_model::facts::calls::late::{Cause, LateCall, MessageDelivery, Repairs, Stage};
 use ros2probe_testing::model::host::{BOB, CAROL, CapturePoint, Host, STRING, WRITER};
@@ -120,6 +120,33 @@ fn a_lost_message_and_those_behind_it_are_late_for_its_retransmission() {
     assert_eq!((stage, cause), (Stage::Receive, Cause::Repaired));
     let (repairs, ..) = robot.call(&behind, 1);
     assert_eq!(repairs, Repairs::default(), "it became ready afterwards");
+}
+
+#[test]
+fn a_message_behind_one_that_the_publisher_gave_up_is_late_for_the_gap() {
+    let mut robot = Robot::new();
+    let before = robot.publish();
+    robot.arrive(&before);
+    let lost = robot.publish();
+    let behind = robot.publish();
+    robot.arrive(&behind);
+    robot.host.wait(50);
+    robot.host.gap(robot.bob, lost.sequence_number);
+    robot.host.wait(2);
+    let (repairs, stage, cause) = robot.call(&behind, 52);
+    let since = Some(Duration::from_millis(2));
+    assert_eq!((repairs.of_message, repairs.of_earlier), (None, since));
+    assert_eq!((stage, cause), (Stage::Receive, Cause::Repaired));
+    let (repairs, ..) = robot.call(&before, 252);
+    assert_eq!(repairs, Repairs::default(), "it is older than the lost one");
+    // A GAP for messages that arrived releases none.
+    let late = robot.publish();
+    robot.arrive(&late);
+    robot.host.wait(50);
+    robot.host.gap(robot.bob, lost.sequence_number);
+    robot.host.gap(robot.bob, late.sequence_number);
+    let (repairs, ..) = robot.call(&late, 50);
+    assert_eq!(repairs, Repairs::default(), "nothing was missing");
 }
 
 #[test]
