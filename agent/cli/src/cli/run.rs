@@ -26,8 +26,8 @@ pub(crate) struct Run {
     /// Configuration file [default: /etc/ros2probe/ros2probe.yaml, if it exists]
     #[arg(long, value_name = "FILE")]
     pub(crate) config: Option<PathBuf>,
-    /// Show a fleet on the page: configuration whose section `fleet` names engine and store, instead
-    /// of the configured section
+    /// Show a fleet on the page: configuration whose section `fleet` names engine and store,
+    /// instead of the configured section
     #[arg(long, value_name = "FILE")]
     pub(crate) fleet: Option<PathBuf>,
     /// Observe a capture (pcap or pcapng, may be gzipped) or a bag of rosbag2 instead of this host;

@@ -350,7 +350,7 @@ fn a_file_for_the_fleet_applies_instead_of_the_configured_section() {
         });
         assert_eq!(answer["problem"], Value::Null, "{more:?}");
     }
-    // A file without an engine would start an agent without the view that the command line asks for.
+    // A file without an engine would start an agent without the requested view.
     let nothing = file("nothing.yaml", "fleet: {job: robots}\n");
     let missing = directory.path().join("missing.yaml");
     for (path, expected) in [

@@ -180,11 +180,13 @@ impl Engine {
         self.max_bytes / BYTES_PER_SERIES
     }
 
-    /// Returns the current value of each series of an expression, and takes their number from `left`.
+    /// Returns the current value of each series of an expression, and takes their number from
+    /// `left`.
     ///
     /// # Errors
     ///
-    /// Fails if the engine cannot be reached, if it refuses the query, or if its answer is too large.
+    /// Fails if the engine cannot be reached, if it refuses the query, or if its answer is too
+    /// large.
     pub(super) async fn query(
         &self,
         expression: &str,

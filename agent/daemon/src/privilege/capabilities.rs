@@ -99,9 +99,9 @@ pub fn check(settings: &CaptureSettings) -> Result<(), Missing> {
     missing(effective, settings).map_or(Ok(()), Err)
 }
 
-/// Returns the capabilities that a process with the `effective` ones lacks; `None` if it has all. If
-/// the agent selects how to observe interfaces, those for packet sockets suffice. The result names
-/// those for tcx where the kernel has it.
+/// Returns the capabilities that a process with the `effective` ones lacks; `None` if it has all.
+/// If the agent selects how to observe interfaces, those for packet sockets suffice. The result
+/// names those for tcx where the kernel has it.
 #[must_use]
 pub fn missing(effective: CapabilitySet, settings: &CaptureSettings) -> Option<Missing> {
     missing_on(effective, settings, tcx::is_supported())
@@ -123,7 +123,8 @@ fn missing_on(
     missing_for(effective, &at_tcx)
 }
 
-/// Returns the missing capabilities, with packet sockets at interfaces unless `settings` require tcx.
+/// Returns the missing capabilities, with packet sockets at interfaces unless `settings` require
+/// tcx.
 fn missing_for(effective: CapabilitySet, settings: &CaptureSettings) -> Option<Missing> {
     // `CAP_SYS_ADMIN`, which is older and wider, includes its successors.
     let inherited = match effective.contains(CapabilitySet::SYS_ADMIN) {

@@ -1,9 +1,10 @@
 //! Messages that a receiver missed at first, until they arrived by a retransmission or their writer
 //! gave them up.
 //!
-//! A reliable reader passes messages on in the order of their sequence numbers. So the later messages of
-//! the same writer wait until the missed one has arrived (RTPS 2.5, 8.4.10.4), or until a GAP declares
-//! it irrelevant (8.3.8.4). A message that a later one overtook counts as a retransmission.
+//! A reliable reader passes messages on in the order of their sequence numbers. So the later
+//! messages of the same writer wait until the missed one has arrived (RTPS 2.5, 8.4.10.4), or until
+//! a GAP declares it irrelevant (8.3.8.4). A message that a later one overtook counts as a
+//! retransmission.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -67,8 +68,8 @@ impl RepairLog {
         }
     }
 
-    /// Notes a GAP of `writer` for a message that the participant `receiver` missed. `source` is a time
-    /// between those of the messages before and after it.
+    /// Notes a GAP of `writer` for a message that the participant `receiver` missed. `source` is a
+    /// time between those of the messages before and after it.
     pub fn push_gap(
         &mut self,
         (writer, receiver): (Guid, GuidPrefix),

@@ -282,7 +282,8 @@ impl Sequence {
     }
 
     /// Returns a time between those of the samples before and after the lowest number of
-    /// `start..end` that may still arrive. Returns `None` without such a number, or if it is unknown.
+    /// `start..end` that may still arrive. Returns `None` without such a number, or if the time is
+    /// unknown.
     #[must_use]
     pub fn source_around(&self, start: SequenceNumber, end: SequenceNumber) -> Option<Timestamp> {
         let mut words = self.undecided_in(start, end);
@@ -458,8 +459,8 @@ impl Sequence {
         self.checkpoints.clear();
     }
 
-    /// Returns the numbers of `start..end` that may still arrive, as bits at `number % 64`. Each word
-    /// comes with the lowest number that it covers.
+    /// Returns the numbers of `start..end` that may still arrive, as bits at `number % 64`. Each
+    /// word comes with the lowest number that it covers.
     fn undecided_in(
         &self,
         start: SequenceNumber,
