@@ -2,9 +2,8 @@
 //! gave them up.
 //!
 //! A reliable reader passes messages on in the order of their sequence numbers. So the later
-//! messages of the same writer wait until the missed one has arrived (RTPS 2.5, 8.4.10.4), or until
-//! a GAP declares it irrelevant (8.3.8.4). A message that a later one overtook counts as a
-//! retransmission.
+//! messages of the same writer wait until the missed one has arrived (RTPS 2.5, 8.4.10.4). A GAP
+//! ends that wait, too (8.3.8.4). A message that a later one overtook counts as a retransmission.
 
 use std::collections::VecDeque;
 use std::time::Duration;
