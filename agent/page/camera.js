@@ -2,6 +2,8 @@
 
 const LEAST = 0.05;
 const MOST = 4;
+/** Least distance between a vertex that was moved into view and the border, in pixels. */
+const MARGIN = 12;
 /** Smallest scale at which names are legible: 11 of the 12 pixels of their font. */
 export const LEGIBLE = 11 / 12;
 
@@ -25,7 +27,11 @@ export class Camera {
     on('pointermove', (event) => this.move(event));
     on('pointerup', (event) => this.up(event));
     on('pointercancel', (event) => this.up(event));
-    this.watch = new ResizeObserver(() => { if (this.fitted && this.size.width) this.fit(); });
+    on('focusin', () => this.follow()?.scrollIntoView({ block: 'nearest', inline: 'nearest' }));
+    this.watch = new ResizeObserver(() => {
+      if (this.fitted && this.size.width) this.fit();
+      this.follow();
+    });
     this.watch.observe(svg);
   }
 
@@ -107,14 +113,26 @@ export class Camera {
     this.apply();
   }
 
-  /** Moves the view if a vertex is outside of it. @param {{x: number, y: number}} at */
-  show(at) {
-    const { width, height } = this.view();
-    const [x, y] = [this.x + at.x * this.scale, this.y + at.y * this.scale];
-    const margin = 60;
-    if (x > margin && x < width - margin && y > margin && y < height - margin) return;
-    this.x += width / 2 - x;
-    this.y += height / 2 - y;
+  /** Keeps the vertex with the keyboard's focus in view. Returns it. @returns {Element|null} */
+  follow() {
+    const focused = this.svg.querySelector(':focus-visible');
+    if (focused) this.show(focused);
+    return focused;
+  }
+
+  /** Moves the view to a vertex if a part of it is outside. @param {Element} vertex */
+  show(vertex) {
+    const [view, own] = [this.svg, vertex].map((each) => each.getBoundingClientRect());
+    const shift = (/** @type {'left'|'top'} */ from, /** @type {'right'|'bottom'} */ to) => {
+      if (own[from] >= view[from] && own[to] <= view[to]) return 0;
+      const toMiddle = (view[from] + view[to] - own[from] - own[to]) / 2;
+      // Of a vertex that is larger than the view, its begin is shown.
+      return Math.max(toMiddle, view[from] + MARGIN - own[from]);
+    };
+    const [x, y] = [shift('left', 'right'), shift('top', 'bottom')];
+    if (!x && !y) return;
+    this.x += x;
+    this.y += y;
     this.fitted = false;
     this.apply();
   }
@@ -148,6 +166,7 @@ export class Camera {
     else if (key === '-' || key === '−') this.zoom(1 / 1.3, width / 2, height / 2);
     else if (key === '0') this.fit();
     else return false;
+    this.follow();
     return true;
   }
 

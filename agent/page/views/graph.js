@@ -301,7 +301,7 @@ export function Graph({ query }) {
     return false;
   };
   const marks = useMemo(() => trail && marked(graph, trail), [graph, trail]);
-  const { picture, milliseconds, failed } = useLayout(graph, JSON.stringify([
+  const { picture, isCurrent, milliseconds, failed } = useLayout(graph, JSON.stringify([
     options.mode, options.boxes, focus, query.chain, query.only]));
   const [chosen, choose] = useState(/** @type {string|null} */ (focus));
   /** Moves the drawing to a vertex. */
@@ -374,9 +374,9 @@ export function Graph({ query }) {
     ${graph.vertices.length > 0 && html`<${Scale} tint=${tint} colours=${colours} />`}
     ${picture && graph.vertices.length > 0 && html`<div class="graph ${isPicked
       ? 'beside' : ''}">
-      <${Drawing} graph=${graph} picture=${picture} chosen=${chosen} choose=${choose}
-        toggle=${toggle} own=${drawing} marks=${marks} scene=${scene} raise=${raise} goTo=${camera}
-        colours=${colours} changes=${compared.found} />
+      <${Drawing} graph=${graph} picture=${picture} isCurrent=${isCurrent} chosen=${chosen}
+        choose=${choose} toggle=${toggle} own=${drawing} marks=${marks} scene=${scene}
+        raise=${raise} goTo=${camera} colours=${colours} changes=${compared.found} />
       <${Panel} graph=${graph} chosen=${chosen} change=${change} toggle=${toggle}
         choose=${choose} names=${vertexNames} chains=${chains.data?.chains ?? []} /></div>`}
     <${Legend} />`;
@@ -412,7 +412,8 @@ function FocusField({ focus, hops, change }) {
 
 /**
  * Returns the layout of a graph, computed in a worker some time after a change of the structure. The
- * order of the one before stays while `kind` does.
+ * order of the one before stays while `kind` does. `isCurrent` is whether the picture is that of
+ * this graph, and not of an earlier one.
  * @param {import('../graph-model.js').Graph} graph
  * @param {string} kind
  */
@@ -420,7 +421,7 @@ function useLayout(graph, kind) {
   const worker = useRef(/** @type {Worker|null} */ (null));
   const number = useRef(0);
   const [answer, take] = useState(/** @type {any} */ ({
-    picture: null, kind, milliseconds: null, failed: '',
+    picture: null, kind, signature: '', milliseconds: null, failed: '',
   }));
   const latest = useRef(answer);
   latest.current = answer;
@@ -439,7 +440,8 @@ function useLayout(graph, kind) {
       own.onmessage = (/** @type {MessageEvent} */ { data }) => {
         if (data.number !== number.current) return;
         take({
-          picture: index(data.result), kind, milliseconds: data.milliseconds, failed: '',
+          picture: index(data.result), kind, signature: graph.signature,
+          milliseconds: data.milliseconds, failed: '',
         });
       };
       /** @type {Record<string, {x: number, y: number}>} */
@@ -456,7 +458,8 @@ function useLayout(graph, kind) {
     const timer = setTimeout(ask, latest.current.picture ? SETTLE_MS : 0);
     return () => clearTimeout(timer);
   }, [graph.signature, kind]);
-  return answer;
+  const isCurrent = answer.kind === kind && answer.signature === graph.signature;
+  return { ...answer, isCurrent };
 }
 
 /**
@@ -499,16 +502,18 @@ function label(edge) {
 }
 
 /**
- * @param {{graph: import('../graph-model.js').Graph, picture: Picture, chosen: string|null,
- *   choose: (key: string|null) => void, toggle: (key: string) => void, own: any,
+ * @param {{graph: import('../graph-model.js').Graph, picture: Picture, isCurrent: boolean,
+ *   chosen: string|null, choose: (key: string|null) => void, toggle: (key: string) => void,
+ *   own: any,
  *   marks: {vertices: Map<string, number>, edges: Set<string>}|null, scene: string,
  *   raise: () => boolean, goTo: any, colours: ReturnType<typeof tinted>,
  *   changes: ReturnType<typeof differences>|null}} props
+ *   `isCurrent` is whether the picture is that of the graph, which it follows some time later;
  *   `marks` are the vertices and edges of a chain; a new `scene` is shown like the first one;
  *   `raise` folds more, and returns whether it can; `goTo` receives a function that moves to a vertex
  */
-function Drawing({ graph, picture, chosen, choose, toggle, own, marks, scene, raise, goTo,
-  colours, changes }) {
+function Drawing({ graph, picture, isCurrent, chosen, choose, toggle, own, marks, scene, raise,
+  goTo, colours, changes }) {
   const stage = useRef(/** @type {SVGGElement|null} */ (null));
   const camera = useRef(/** @type {Camera|null} */ (null));
   useEffect(() => {
@@ -519,6 +524,8 @@ function Drawing({ graph, picture, chosen, choose, toggle, own, marks, scene, ra
   const shownScene = useRef(scene);
   const renewed = useRef(false);
   useEffect(() => {
+    // The picture of the scene before would decide what is legible.
+    if (!isCurrent) return;
     if (shownScene.current !== scene) {
       shownScene.current = scene;
       renewed.current = false;
@@ -544,8 +551,7 @@ function Drawing({ graph, picture, chosen, choose, toggle, own, marks, scene, ra
   const framed = useRef('');
   useEffect(() => {
     const places = [...marks?.vertices.keys() ?? []].map((key) => picture.at.get(key));
-    // The layout follows the structure some time later.
-    if (passed === framed.current || places.includes(undefined)) return;
+    if (!isCurrent || passed === framed.current || places.includes(undefined)) return;
     framed.current = passed;
     camera.current?.part(/** @type {any[]} */ (places));
   }, [passed, picture]);
@@ -566,10 +572,7 @@ function Drawing({ graph, picture, chosen, choose, toggle, own, marks, scene, ra
     event.preventDefault();
     choose(next);
     for (const element of own.current.querySelectorAll('[data-key]')) {
-      if (element.getAttribute('data-key') === next) {
-        element.focus();
-        camera.current?.show(/** @type {any} */ (picture.at.get(next)));
-      }
+      if (element.getAttribute('data-key') === next) element.focus();
     }
   };
   const labelled = useMemo(() => freeLabels(graph, picture), [graph, picture]);

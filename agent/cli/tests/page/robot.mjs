@@ -110,6 +110,74 @@ async function topic(tab) {
   await tab.shows('uint32 height', 'section[aria-labelledby="definition"]');
 }
 
+/** Zooms with the wheel at the upper left corner of the graph, which moves the rest out of view. */
+async function enlarge(tab, isEnough = async (scale) => scale > 2) {
+  const canvas = tab.page.locator('.canvas');
+  await until('a larger picture', async () => {
+    const { x, y } = await canvas.boundingBox();
+    await tab.page.mouse.move(x + 5, y + 5);
+    await tab.page.mouse.wheel(0, -200);
+    const transform = await canvas.locator('svg > g').getAttribute('transform');
+    return isEnough(Number(/scale\(([\d.]+)\)/.exec(transform)[1]));
+  });
+}
+
+/** Waits until a graph that was enlarged is shown anew: legible, in the window, not enlarged. */
+const refitted = (tab, what) => until(`${what}, shown anew`, async () =>
+  (await tab.legible(what)) < 15);
+
+/** A wide window has the drawing alone, until something is chosen. */
+async function wide(tab) {
+  const { page } = tab;
+  await page.setViewportSize({ width: 1920, height: 1080 });
+  const canvas = page.locator('.canvas');
+  const rest = async () => (await page.evaluate(() => document.documentElement.clientWidth))
+    - (await canvas.boundingBox()).width;
+  await until('a drawing as wide as the window', async () => (await rest()) < 40);
+  assert.equal(await page.locator('#graph-panel').count(), 0);
+  await page.getByRole('button', { name: /^\/lidar / }).focus();
+  await until('details beside the drawing', async () => (await rest()) > 300
+    && (await page.locator('#graph-panel').isVisible()));
+  await page.getByRole('button', { name: 'Close the details' }).click();
+  await page.setViewportSize({ width: 1280, height: 800 });
+  await gone(page.locator('#graph-panel'));
+}
+
+/** The wheel zooms, as a hint says. Vertices out of view that keys reach are moved into view. */
+async function walk(tab, vertex) {
+  const { page } = tab;
+  await page.getByText('The wheel zooms, dragging moves').waitFor();
+  /** Whether a vertex is in the window of the graph as a whole. */
+  const isSeen = (element) => {
+    const [own, canvas] = [element, element.closest('.canvas') ?? document.querySelector('.canvas')]
+      .map((each) => each.getBoundingClientRect());
+    return element.hasAttribute('data-key') && own.left >= canvas.left && own.right <= canvas.right
+      && own.top >= Math.max(0, canvas.top) && own.bottom <= Math.min(innerHeight, canvas.bottom);
+  };
+  await enlarge(tab);
+  await vertex('/lidar').focus();
+  const reached = new Set();
+  for (const to of ['Right', 'Right', 'Down', 'Left', 'Down', 'Up']) {
+    await page.keyboard.press(`Arrow${to}`);
+    const focused = page.locator(':focus');
+    await until(`the vertex to the ${to} is seen`, () => focused.evaluate(isSeen));
+    reached.add(await focused.getAttribute('data-key'));
+  }
+  assert.ok(reached.size >= 2, `${[...reached]}`);
+  // So does Tab.
+  await page.getByRole('button', { name: 'Fit' }).click();
+  const points = vertex('/points');
+  await points.focus();
+  await enlarge(tab, async () => !await points.evaluate(isSeen));
+  await page.getByRole('button', { name: 'Zoom in' }).focus();
+  await page.keyboard.press('Shift+Tab');
+  await until('the vertex that Tab reaches is seen', () => points.evaluate(isSeen));
+  assert.ok(await points.evaluate((own) => own === document.activeElement));
+  await page.getByRole('button', { name: 'Fit' }).click();
+  await page.getByRole('button', { name: 'Close the details' }).click();
+  await gone(page.locator('#graph-panel'));
+}
+
 async function graph(tab) {
   await tab.page.getByRole('link', { name: 'In the graph' }).click();
   await tab.heading('Graph');
@@ -118,8 +186,10 @@ async function graph(tab) {
   await vertex('/points').waitFor();
   await vertex('/lidar').waitFor();
   await gone(vertex('/cmd_vel'));
+  await enlarge(tab);
   await tab.page.getByRole('button', { name: 'Show all' }).click();
   await vertex('/cmd_vel').waitFor();
+  await refitted(tab, 'the graph without a focus');
   await gone(vertex('/rosout'));
   // One pair is within a process.
   const styles = await tab.inked();
@@ -153,6 +223,8 @@ async function graph(tab) {
   await tab.legible('the graph of the robot');
   await tab.page.getByRole('button', { name: 'Close the details' }).click();
   await gone(tab.page.locator('#graph-panel'));
+  await wide(tab);
+  await walk(tab, vertex);
   await tab.page.getByLabel('Find', { exact: true }).fill('imu_dri');
   await tab.page.keyboard.press('Enter');
   await reads(tab.page.locator('#graph-panel'), '/imu_driver');
@@ -182,8 +254,10 @@ async function graph(tab) {
   await until('services', async () => (await tab.page.locator('.vertex.service').count()) > 0);
   await there(vertex('/add_two_ints'));
   await tab.page.getByRole('checkbox', { name: /^services/ }).uncheck();
+  await enlarge(tab);
   await tab.page.getByRole('combobox', { name: 'Boxes' }).selectOption('process');
   await until('boxes of processes', async () => (await tab.page.locator('.box').count()) >= 3);
+  await refitted(tab, 'boxes of processes');
   await reads(tab.page.locator('.canvas'), LIDAR);
   // A box is closed and opened.
   const box = tab.page.locator('.box [role="button"]', { hasText: new RegExp(LIDAR) }).first();
@@ -195,9 +269,11 @@ async function graph(tab) {
   await tab.page.keyboard.press('Enter');
   await until('an open box', async () => (await tab.page.locator('.vertex.box').count()) === 0);
   await tab.page.getByRole('combobox', { name: 'Boxes' }).selectOption('none');
+  await enlarge(tab);
   await tab.page.getByRole('combobox', { name: 'Show' }).selectOption('nodes');
   await until('nodes only', async () => (await tab.page.locator('.vertex.topic').count()) === 0
     && (await tab.page.locator('.edge.active, .edge').count()) > 0);
+  await refitted(tab, 'nodes only');
   await tab.page.getByRole('checkbox', { name: /^hubs/ }).check();
   await until('hubs', async () => (await tab.page.locator('.edge').count()) > 0);
 }
@@ -218,6 +294,18 @@ async function graphs(_, open, browser) {
       const shown = await tab.page.locator('.box, .vertex.box').count();
       assert.ok(edges >= 15 && shown >= boxes, `${what}: ${edges} edges, ${shown} boxes`);
       console.log(`${what}: ${size.toFixed(1)} px, ${edges} edges, ${shown} boxes`);
+      // From one node to all: the picture of all decides what is folded, not that of the node.
+      if (nodes === 200 && !query) {
+        await tab.page.evaluate((key) => {
+          location.hash = `#/graph?focus=${encodeURIComponent(key)}`;
+        }, 'node:0:/part_0/node_0');
+        await tab.page.reload();
+        await tab.page.locator('.vertex').first().waitFor();
+        await tab.page.getByRole('button', { name: 'Show all' }).click();
+        await until(`${what}, after one`, async () =>
+          (await tab.page.locator('.box, .vertex.box').count()) >= boxes
+          && (await tab.legible(what)) < 15);
+      }
       await tab.page.close();
       await context.close();
     }
