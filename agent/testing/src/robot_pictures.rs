@@ -12,6 +12,10 @@ pub const MAP: &str = "nav_msgs::msg::dds_::OccupancyGrid_";
 pub const SCAN: &str = "sensor_msgs::msg::dds_::LaserScan_";
 /// Type of [`odometry`].
 pub const ODOMETRY: &str = "nav_msgs::msg::dds_::Odometry_";
+/// Type of [`stamped_pose`].
+pub const STAMPED_POSE: &str = "geometry_msgs::msg::dds_::PoseStamped_";
+/// Type of [`path`].
+pub const PATH: &str = "nav_msgs::msg::dds_::Path_";
 
 /// A red pixel as PNG.
 const RED_PIXEL: [u8; 69] = [
@@ -96,6 +100,26 @@ pub fn scan(count: u16) -> Vec<u8> {
     number(&mut body, count.into());
     floats(&mut body, &vec![2.0; count.into()]);
     number(&mut body, 0);
+    payload(&body)
+}
+
+/// Returns a pose with a header.
+#[must_use]
+pub fn stamped_pose(x: f64, y: f64) -> Vec<u8> {
+    let mut body = header();
+    pose(&mut body, x, y);
+    payload(&body)
+}
+
+/// Returns a path through these places.
+#[must_use]
+pub fn path(places: &[(f64, f64)]) -> Vec<u8> {
+    let mut body = header();
+    number(&mut body, places.len());
+    for (x, y) in places {
+        body.extend(header());
+        pose(&mut body, *x, *y);
+    }
     payload(&body)
 }
 

@@ -134,7 +134,7 @@ fn a_message_is_shown_as_a_tree_with_charts_of_its_numbers() -> Result<()> {
 }
 
 #[test]
-fn images_maps_scans_and_poses_have_a_picture() -> Result<()> {
+fn images_maps_scans_poses_and_paths_have_a_picture() -> Result<()> {
     let link = Link::new()?;
     let config = tempfile::tempdir()?;
     let agent = robot_parts::agent(&link, &config, "")?;
@@ -144,12 +144,14 @@ fn images_maps_scans_and_poses_have_a_picture() -> Result<()> {
         (3, "mapper", ("rt/map", robot_pictures::MAP)),
         (4, "lidar", ("rt/scan", robot_pictures::SCAN)),
         (5, "base", ("rt/odom", robot_pictures::ODOMETRY)),
+        (6, "pilot", ("rt/goal", robot_pictures::STAMPED_POSE)),
+        (7, "planner", ("rt/plan", robot_pictures::PATH)),
     ];
     let mut nodes = Vec::new();
     for (number, name, topic) in topics {
         nodes.push(Node::start(&link, number, name, topic)?);
     }
-    agent.scrape_until("all nodes", |page| page.sum("ros2_nodes", &[]) == 5.0)?;
+    agent.scrape_until("all nodes", |page| page.sum("ros2_nodes", &[]) == 7.0)?;
     let mut passed = 0.0;
     let output_text = || {
         passed += 0.5;
@@ -159,6 +161,8 @@ fn images_maps_scans_and_poses_have_a_picture() -> Result<()> {
             robot_pictures::map(),
             robot_pictures::scan(100),
             robot_pictures::odometry(passed, 1.0),
+            robot_pictures::stamped_pose(passed, 1.0),
+            robot_pictures::path(&[(0.0, 0.0), (1.0, 0.0), (1.0, 1.0)]),
         ];
         for (node, message) in nodes.iter_mut().zip(messages) {
             node.renew()?;
