@@ -3,6 +3,8 @@
 
 import { useEffect, useRef, useState } from './vendor/hooks.mjs';
 import { clock, date, NOTHING, when } from './format.js';
+import { stream } from './store.js';
+import { marksOf, useEvents } from './timebar.js';
 import { colour, html } from './ui.js';
 
 const uPlot = /** @type {any} */ (globalThis).uPlot;
@@ -217,12 +219,29 @@ export function Chart({ title, times, lines, print, note, whole, fitted, pick, s
 }
 
 /**
- * A bar for each step of a time, whose parts have the colours of a legend.
- * @param {{label: string, bars: (number[]|null)[], kinds: [string, string][], words: string}} props
- *   `bars` are the values of each kind, null while unknown; `kinds` are words and CSS variables;
- *   `words` say what one bar and the range are
+ * Lines over bars for warnings and errors.
+ * @param {{from: number, end: number, width: number, height: number}} props
+ *   `from` and `end` are the Unix times at both sides; the others are the size of the drawing
  */
-export function Bars({ label, bars, kinds, words }) {
+export function EventLines({ from, end, width, height }) {
+  const events = useEvents({ at: stream.at, span: end - from });
+  const marks = marksOf(events.filter(({ severity }) => severity !== 'INFO'));
+  return marks.filter(({ time }) => time >= from && time <= end).map(({ time, severity }, key) => {
+    const x = (width * (time - from)) / (end - from);
+    return html`<line key=${key} x1=${x} x2=${x} y1="0" y2=${height}
+      style="stroke: var(${MARKS[severity] ?? '--dim'})" />`;
+  });
+}
+
+/**
+ * A bar for each step of a time, whose parts have the colours of a legend.
+ * @param {{label: string, bars: (number[]|null)[], kinds: [string, string][], words: string,
+ *   from: number, step: number}} props
+ *   `bars` are the values of each kind, null while unknown; `kinds` are words and CSS variables;
+ *   `words` say what one bar and the range are; `from` is the Unix time at which the first bar
+ *   begins, and `step` the seconds of each
+ */
+export function Bars({ label, bars, kinds, words, from, step }) {
   const sums = kinds.map((_, kind) => bars.reduce((sum, bar) => sum + (bar?.[kind] ?? 0), 0));
   const highest = Math.max(1, ...bars.map((bar) => (bar ?? []).reduce((sum, value) => sum + value, 0)));
   const text = kinds.map(([kind], at) => `${sums[at]} ${kind}`).join(', ');
@@ -235,7 +254,9 @@ export function Bars({ label, bars, kinds, words }) {
       return html`<rect key=${`${place} ${kind}`} x=${10 * place + 1} width="8" y=${top} height=${height}
         style="fill: var(${kinds[kind][1]})" />`;
     });
-  })}</svg><figcaption><span>${kinds.map(([kind, variable], at) => html`<span key=${kind} class="cause"
+  })}<${EventLines} from=${from} end=${from + step * bars.length} width=${10 * bars.length}
+    height=${100} /></svg><figcaption>
+    <span>${kinds.map(([kind, variable], at) => html`<span key=${kind} class="cause"
       style="--cause: var(${variable})">${kind} ${sums[at]}</span>`)}</span>
     <span class="dim">${words}; the highest bar is ${highest}</span></figcaption></figure>`;
 }

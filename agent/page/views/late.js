@@ -1,5 +1,6 @@
 // A part of the views of a topic and of a node: which calls of callbacks were late, and why.
 
+import { EventLines } from '../chart.js';
 import { clock } from '../format.js';
 import { callsOf, causes, closest, missing, timeline, WIDTH, worst } from '../late.js';
 import { state } from '../store.js';
@@ -77,7 +78,8 @@ function Timeline({ why, picked }) {
         ${it.parts.map((/** @type {any} */ part) => html`<rect key=${part.cause}
           x=${BAR * it.place + 1} width=${BAR - 2} y=${HEIGHT * (1 - part.from - part.height)}
           height=${HEIGHT * part.height} style="fill: var(${part.colour})" />`)}</g>`;
-  })}</svg>
+  })}<${EventLines} from=${shown.from} end=${shown.end} width=${BAR * shown.periods}
+      height=${HEIGHT} /></svg>
     <p class="dim">${clock(shown.from)} to ${clock(shown.end)}. Choose a bar to list its calls.</p>
     ${status}
     ${bar && html`<div class="scroll" tabindex="0" role="group" aria-label="Calls of a period"><table>

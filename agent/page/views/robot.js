@@ -140,8 +140,9 @@ function LogChart({ answer }) {
   if (answer.data) current.take(answer.data, false);
   if (!current.totals?.some((/** @type {number} */ total) => total > 0)) return null;
   const { since, time } = current;
-  return html`<${Bars} label="Messages a minute" bars=${current.bars()} kinds=${KINDS}
-    words=${`a bar is a minute, from ${clock(60 * (Math.floor(time / 60) - MINUTES + 1))} to ${clock(time)}${
+  const from = 60 * (Math.floor(time / 60) - MINUTES + 1);
+  return html`<${Bars} label="Messages a minute" bars=${current.bars()} kinds=${KINDS} from=${from}
+    step=${60} words=${`a bar is a minute, from ${clock(from)} to ${clock(time)}${
       since == null ? '' : `, known since ${clock(since)}`}`} />`;
 }
 

@@ -124,7 +124,10 @@ fn a_press_of_a_button_measures_a_topic_down_to_the_kernel() -> Result<()> {
 #[test]
 fn a_message_is_shown_as_a_tree_with_charts_of_its_numbers() -> Result<()> {
     let place = Place::new()?;
-    let _agent = place.agent("")?;
+    let state = place.directory.path().join("state");
+    std::fs::create_dir(&state)?;
+    let state = state.display();
+    let _agent = place.agent(&format!("watch: [/imu]\nstate_directory: {state}\n"))?;
     let _robot = Robot::start(&place.host)?;
     let mut answers = |question: &str| {
         ensure!(question == "streams", "{question}");

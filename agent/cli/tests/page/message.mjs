@@ -2,6 +2,7 @@
 // agent decodes messages only while the tree is open.
 
 import assert from 'node:assert/strict';
+import { marked, READBACK, shared, warn } from './charts.mjs';
 import { ask, gone, reads, scenario, until } from './tab.mjs';
 
 await scenario(async (open) => {
@@ -33,6 +34,11 @@ await scenario(async (open) => {
   await until('a chart of it', async () => /last -?[\d.]+, minimum/.test(
     await chart.getAttribute('aria-label')));
   await until('points', async () => (await chart.locator('canvas').count()) === 1);
+  // It marks the same events as the five charts of the topic, and has the same cursor.
+  tab.expect(READBACK);
+  await warn(tab.page, 2);
+  await marked(tab.page, 6);
+  await shared(tab.page, chart);
   const values = section.locator('figure', { hasText: 'linear_acceleration.z' });
   await values.getByRole('button', { name: 'Table' }).click();
   await until('its values', async () => (await values.locator('tbody tr').count()) >= 1);

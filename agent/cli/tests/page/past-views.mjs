@@ -2,7 +2,8 @@
 // before. Argument: address.
 
 import assert from 'node:assert/strict';
-import { ask, gone, reads, scenario } from './tab.mjs';
+import { warn } from './charts.mjs';
+import { ask, gone, reads, scenario, there } from './tab.mjs';
 
 /** Views, what they show of the present, and of the past. The past shows nothing of the present. */
 const viewsOf = (process) => [
@@ -43,6 +44,11 @@ await scenario(async (open) => {
     // The chart of logs has the messages of that time.
     if (view === 'robot/logs') await reads(main, /errors 1[^]*a bar is a minute/);
   }
+  // The chart of logs marks the events of that time.
+  await warn(page, 15);
+  await page.goto(`${tab.address}${at('robot/logs')}`);
+  await there(page.locator('.bars line'));
+  await page.unroute('**/history/events*');
   for (const [view, why] of [['recordings', 'Bags are those'], ['doctor', 'The doctor examines']]) {
     await page.goto(`${tab.address}${at(view)}`);
     await reads(main, new RegExp(`${why}[^]*This view has no history`));

@@ -2,6 +2,7 @@
 // robot's topics, charts, processes and events, and the page returns to the present.
 
 import assert from 'node:assert/strict';
+import { marked, READBACK, shared, warn } from './charts.mjs';
 import { ask, gone, reads, scenario, there, until } from './tab.mjs';
 
 await scenario(async (open) => {
@@ -53,6 +54,17 @@ await scenario(async (open) => {
   });
   await page.goBack();
   await until('the time before', async () => page.url() === before);
+
+  // Every chart of a topic and of a process marks the events of its time, and has the same cursor.
+  tab.expect(READBACK);
+  await warn(page, 15);
+  await page.reload();
+  await marked(page, 5);
+  await shared(page, rate);
+  await page.goto(`${before.split('#')[0]}#/nodes/%2Flidar?at=${end}&span=${end - begin}`);
+  await marked(page, 2);
+  await shared(page, charts.first());
+  await page.unroute('**/history/events*');
 
   // Events and processes of that time.
   await page.getByRole('link', { name: 'Events', exact: true }).first().click();
