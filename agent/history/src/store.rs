@@ -89,13 +89,13 @@ impl Tier {
         }
     }
 
-    /// Returns the tier's part of a limit: an eighth is for documents. Of the rest, two thirds are
-    /// for seconds and one third for steps of ten seconds.
+    /// Returns the tier's part of a limit. With the default limit, each part is enough for the
+    /// documented times of 200 topics.
     const fn budget(self, limit: u64) -> u64 {
         match self {
-            Self::Seconds => limit / 24 * 14,
+            Self::Seconds => limit / 24 * 13,
             Self::Tens => limit / 24 * 7,
-            Self::Documents => limit / 24 * 3,
+            Self::Documents => limit / 24 * 4,
         }
     }
 
@@ -566,4 +566,25 @@ fn begin_of(path: &Path) -> Option<u32> {
     let is_ours = path.extension()?.to_str()? == FILE_EXTENSION;
     let (_, number) = path.file_stem()?.to_str()?.split_once('-')?;
     number.parse().ok().filter(|_| is_ours)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Documented bytes a day of 200 topics (docs/history.md): rows, and documents if the rate of
+    /// each publisher varies.
+    const ROWS_A_DAY: u64 = 89_000_000;
+    const DOCUMENTS_A_DAY: u64 = 5_500_000;
+
+    #[test]
+    fn the_default_limit_has_a_day_of_seconds_and_a_week_of_documents() {
+        let limit = 256 << 20;
+        let [seconds, tens, documents] = Tier::ALL.map(|tier| tier.budget(limit));
+        assert!(seconds + tens + documents <= limit);
+        assert!(seconds >= ROWS_A_DAY, "{seconds}");
+        // The oldest file is deleted as a whole.
+        let file = DOCUMENTS_A_DAY / 86_400 * u64::from(Tier::Documents.span());
+        assert!(documents >= 7 * DOCUMENTS_A_DAY + file, "{documents}");
+    }
 }

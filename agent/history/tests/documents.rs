@@ -144,7 +144,7 @@ fn a_message_of_a_log_is_stored_once() {
 }
 
 #[test]
-fn the_oldest_documents_are_deleted_beyond_their_eighth_of_the_limit() {
+fn the_oldest_documents_are_deleted_beyond_their_sixth_of_the_limit() {
     let directory = tempfile::tempdir().unwrap();
     let limit = 4 << 20;
     let store = Store::open(directory.path(), limit).unwrap();
@@ -154,9 +154,9 @@ fn the_oldest_documents_are_deleted_beyond_their_eighth_of_the_limit() {
     };
     for minute in 0..400 {
         append(&store, minute, vec![random(minute * 1_000)]);
-        assert!(size(directory.path()) <= limit / 8);
+        assert!(size(directory.path()) <= limit / 6);
     }
-    assert!(size(directory.path()) > limit / 12);
+    assert!(size(directory.path()) > limit / 8);
     assert_eq!(store.document("logs", 60), None);
     let last = content(&store, "logs", 400 * 60);
     assert_eq!(last, Some(random(399 * 1_000).content));
