@@ -127,7 +127,7 @@ const refitted = (tab, what) => until(`${what}, shown anew`, async () =>
   (await tab.legible(what)) < 15);
 
 /** A wide window has the drawing alone, until something is chosen. */
-async function wide(tab) {
+async function alone(tab) {
   const { page } = tab;
   await page.setViewportSize({ width: 1920, height: 1080 });
   const canvas = page.locator('.canvas');
@@ -223,7 +223,7 @@ async function graph(tab) {
   await tab.legible('the graph of the robot');
   await tab.page.getByRole('button', { name: 'Close the details' }).click();
   await gone(tab.page.locator('#graph-panel'));
-  await wide(tab);
+  await alone(tab);
   await walk(tab, vertex);
   await tab.page.getByLabel('Find', { exact: true }).fill('imu_dri');
   await tab.page.keyboard.press('Enter');
