@@ -130,15 +130,20 @@ impl Dissection {
         let mut fragments: BTreeMap<u64, BTreeSet<u32>> = BTreeMap::new();
         let (mut began, mut newest, mut announced) = (None, 0, 0);
         let mut requested = BTreeSet::new();
+        let mut present = false;
         for frame in &self.frames {
             let own = frame.prefix == prefix;
+            present |= own;
             for submessage in &frame.submessages {
                 if submessage.writer != entity {
                     continue;
                 }
                 match submessage.content {
-                    // Only two participants exist, so the other one's request is for this writer.
-                    Content::Request { first, end } if !own => requested.extend(first..end),
+                    // Only two participants exist at a time, so the other one's request is for
+                    // this writer. Before it, the number may be that of an earlier writer.
+                    Content::Request { first, end } if !own && present => {
+                        requested.extend(first..end);
+                    }
                     _ if !own => {}
                     Content::Data(number) => {
                         if samples.whole.contains_key(&number) {
