@@ -3,7 +3,8 @@
 //!
 //! A reliable reader passes messages on in the order of their sequence numbers. So the later
 //! messages of the same writer wait until the missed one has arrived (RTPS 2.5, 8.4.10.4). A GAP
-//! ends that wait, too (8.3.8.4). A message that a later one overtook counts as a retransmission.
+//! ends that wait, too (8.3.8.4), and so does a HEARTBEAT with a higher firstSN (8.3.8.6). A message
+//! that a later one overtook counts as a retransmission.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -22,7 +23,8 @@ const ROUNDING: u64 = 1;
 /// Time for which a retransmission is remembered. Late calls are reported once a second.
 const LIFETIME: Duration = Duration::from_secs(5);
 
-/// The latest retransmissions, and GAPs in their place, that reached receivers on this host.
+/// The latest retransmissions, and GAPs or HEARTBEATs in their place, that reached receivers on this
+/// host.
 #[derive(Debug, Default)]
 pub struct RepairLog(Bounded<Retransmissions, VecDeque<Repaired>>);
 
@@ -67,9 +69,9 @@ impl RepairLog {
         }
     }
 
-    /// Notes a GAP of `writer` for a message that the participant `receiver` missed. `source` is a
+    /// Notes that `writer` gave up a message that the participant `receiver` missed. `source` is a
     /// time between those of the messages before and after it.
-    pub fn push_gap(
+    pub fn push_given_up(
         &mut self,
         (writer, receiver): (Guid, GuidPrefix),
         source: Timestamp,
@@ -182,9 +184,9 @@ mod tests {
     }
 
     #[test]
-    fn a_gap_releases_the_messages_after_it_and_none_before() {
+    fn a_message_given_up_releases_those_after_it_and_none_before() {
         let mut log = RepairLog::default();
-        log.push_gap(PAIR, source(105), at(180));
+        log.push_given_up(PAIR, source(105), at(180));
         let waited = |message: u64| {
             log.of(
                 Awaited {

@@ -333,21 +333,21 @@ impl Delivery {
         }
         let sequence = self.reception.sequence();
         let before = (sequence.next(), sequence.last_advance());
+        let known = sequence.available();
         let (reception, budget, mut accounting) = self.split(context);
         reception.heartbeat(heartbeat, budget, &mut |decision| {
             accounting.take(decision);
         });
         self.mark_unread_irrelevant(before);
+        let sequence = self.reception.sequence();
+        let source = sequence.source_around(known, sequence.available());
+        self.note_given_up(source, context);
     }
 
-    /// Records a GAP for this receiver. The messages behind a missed one waited for it.
+    /// Records a GAP for this receiver.
     pub fn gap(&mut self, gap: &Gap, context: &mut DeliveryContext<'_>) {
         self.note_seen(context.now);
-        if let Some(source) = self.source_around(gap)
-            && let Some(pair) = self.repaired_pair(context)
-        {
-            context.journal.repairs.push_gap(pair, source, context.now);
-        }
+        self.note_given_up(self.source_around(gap), context);
         let (reception, budget, mut accounting) = self.split(context);
         reception.gap(gap, budget, &mut |decision| accounting.take(decision));
     }
@@ -573,9 +573,6 @@ impl Delivery {
     /// Returns a time between those of the samples before and after one that the GAP withdraws and
     /// that the receiver misses. Returns `None` if it misses none of them.
     fn source_around(&self, gap: &Gap) -> Option<Timestamp> {
-        if self.direction() != Direction::Received {
-            return None;
-        }
         let sequence = self.reception.sequence();
         let before_base = sequence.source_around(gap.start, gap.list.base);
         before_base.or_else(|| {
@@ -586,11 +583,21 @@ impl Delivery {
 
     /// Returns the writer and the receiving participant, if the former sends samples again.
     fn repaired_pair(&self, context: &DeliveryContext<'_>) -> Option<(Guid, GuidPrefix)> {
+        let is_repaired = self.direction() == Direction::Received && self.is_reliable(context);
         match self.receiver {
-            Receiver::Participant(receiver) if self.is_reliable(context) => {
-                Some((context.writer, receiver))
-            }
+            Receiver::Participant(receiver) if is_repaired => Some((context.writer, receiver)),
             _ => None,
+        }
+    }
+
+    /// Notes that the writer gave up a missed sample with about this source timestamp: the samples
+    /// behind it waited until now.
+    fn note_given_up(&self, source: Option<Timestamp>, context: &mut DeliveryContext<'_>) {
+        if let Some(source) = source
+            && let Some(pair) = self.repaired_pair(context)
+        {
+            let repairs = &mut context.journal.repairs;
+            repairs.push_given_up(pair, source, context.now);
         }
     }
 

@@ -376,6 +376,12 @@ impl Sequence {
         self.complete = self.complete.max(number.min(self.next));
     }
 
+    /// Returns the lowest number that the writer still has; zero before its first HEARTBEAT.
+    #[must_use]
+    pub const fn available(&self) -> SequenceNumber {
+        self.available
+    }
+
     /// Returns the number below which the writer retransmits no sample.
     #[must_use]
     pub fn awaited(&self) -> SequenceNumber {

@@ -181,7 +181,7 @@ pub struct Repairs {
     /// The message itself was lost at first.
     pub of_message: Option<Duration>,
     /// An earlier message of the same publisher was lost at first. The middleware kept the later ones
-    /// until it arrived, or until the publisher gave it up (GAP).
+    /// until it arrived, or until the publisher gave it up (GAP, or firstSN of a HEARTBEAT).
     pub of_earlier: Option<Duration>,
 }
 

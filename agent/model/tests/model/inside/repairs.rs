@@ -124,6 +124,19 @@ fn a_lost_message_and_those_behind_it_are_late_for_its_retransmission() {
 
 #[test]
 fn a_message_behind_one_that_the_publisher_gave_up_is_late_for_the_gap() {
+    is_late_until_given_up(|robot, number| robot.host.gap(robot.bob, number));
+}
+
+#[test]
+fn a_message_behind_one_that_the_publisher_gave_up_is_late_for_the_heartbeat() {
+    is_late_until_given_up(|robot, number| {
+        let first = number + 1;
+        robot.host.heartbeat(robot.bob, first, first);
+    });
+}
+
+/// Checks what a submessage by which the publisher gives up a message explains.
+fn is_late_until_given_up(give_up: impl Fn(&mut Robot, u64)) {
     let mut robot = Robot::new();
     let before = robot.publish();
     robot.arrive(&before);
@@ -131,20 +144,23 @@ fn a_message_behind_one_that_the_publisher_gave_up_is_late_for_the_gap() {
     let behind = robot.publish();
     robot.arrive(&behind);
     robot.host.wait(50);
-    robot.host.gap(robot.bob, lost.sequence_number);
+    // The publisher still has the lost message.
+    robot.host.heartbeat(robot.bob, 1, robot.number);
+    robot.host.wait(10);
+    give_up(&mut robot, lost.sequence_number);
     robot.host.wait(2);
-    let (repairs, stage, cause) = robot.call(&behind, 52);
+    let (repairs, stage, cause) = robot.call(&behind, 62);
     let since = Some(Duration::from_millis(2));
     assert_eq!((repairs.of_message, repairs.of_earlier), (None, since));
     assert_eq!((stage, cause), (Stage::Receive, Cause::Repaired));
-    let (repairs, ..) = robot.call(&before, 252);
+    let (repairs, ..) = robot.call(&before, 262);
     assert_eq!(repairs, Repairs::default(), "it is older than the lost one");
-    // A GAP for messages that arrived releases none.
+    // Neither a submessage for messages that arrived nor a repeated one releases any.
     let late = robot.publish();
     robot.arrive(&late);
     robot.host.wait(50);
-    robot.host.gap(robot.bob, lost.sequence_number);
-    robot.host.gap(robot.bob, late.sequence_number);
+    give_up(&mut robot, lost.sequence_number);
+    give_up(&mut robot, late.sequence_number);
     let (repairs, ..) = robot.call(&late, 50);
     assert_eq!(repairs, Repairs::default(), "nothing was missing");
 }
