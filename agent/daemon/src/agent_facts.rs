@@ -126,7 +126,7 @@ pub struct InsideSourceFacts {
     pub counters: Vec<(&'static str, u64)>,
     /// What is observed about late calls: `off`, `sums` or `events`.
     pub late: &'static str,
-    /// Why the scheduler's events are not observed although they are needed.
+    /// Why the scheduler's events are not observed when they are needed.
     pub without_events: Option<String>,
     /// Why deliveries of messages are not followed although they are needed.
     pub without_deliveries: Option<String>,
@@ -192,6 +192,8 @@ pub enum Ability {
     SharedMemoryExact,
     /// Counts from inside processes, whatever the transport.
     Inside,
+    /// All causes of late calls: by the scheduler's events, and by the way of messages.
+    LateCauses,
 }
 
 /// Counters of one interface.
@@ -251,6 +253,17 @@ impl AgentFacts {
     }
 }
 
+impl InsideSourceFacts {
+    /// Returns why not all causes of late calls are observed. Where late calls are off, nothing is
+    /// missing for them.
+    #[must_use]
+    pub fn without_causes(&self) -> Option<&str> {
+        let without_deliveries = self.without_deliveries.as_deref();
+        let without_deliveries = without_deliveries.filter(|_| self.late != "off");
+        self.without_events.as_deref().or(without_deliveries)
+    }
+}
+
 impl SourceKind {
     /// Returns the label value.
     #[must_use]
@@ -276,7 +289,7 @@ impl SourceKind {
 
 impl Ability {
     /// All abilities.
-    pub const ALL: [Self; 10] = [
+    pub const ALL: [Self; 11] = [
         Self::Subscribers,
         Self::Sent,
         Self::SocketLosses,
@@ -287,6 +300,7 @@ impl Ability {
         Self::SharedMemory,
         Self::SharedMemoryExact,
         Self::Inside,
+        Self::LateCauses,
     ];
 
     /// Returns the label value.
@@ -303,6 +317,7 @@ impl Ability {
             Self::SharedMemory => "shared_memory",
             Self::SharedMemoryExact => "shared_memory_exact",
             Self::Inside => "inside",
+            Self::LateCauses => "late_causes",
         }
     }
 }

@@ -192,9 +192,15 @@ impl LateObservation {
         }
     }
 
-    /// Returns why they are not observed although they are needed.
-    pub(super) fn without_events(&self) -> Option<&str> {
-        self.without_events.as_ref().map(Reason::as_str)
+    /// Returns why the scheduler's events are not observed when they are needed. A refusal of the
+    /// kernel is known before that.
+    pub(super) fn without_events(&self) -> Option<String> {
+        let refused = || match self.choice {
+            LateChoice::Off => None,
+            LateChoice::Auto | LateChoice::On => self.programs.without_scheduler(),
+        };
+        let reason = self.without_events.clone().or_else(refused);
+        reason.map(|reason| reason.0)
     }
 
     /// Returns why deliveries of messages are not followed although they are needed.

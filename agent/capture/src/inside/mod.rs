@@ -72,7 +72,7 @@ pub struct Facts {
     pub shows_rates: bool,
     /// What is observed about late calls: `off`, `sums` or `events`.
     pub late: &'static str,
-    /// Why the scheduler's events are not observed although they are needed.
+    /// Why the scheduler's events are not observed when they are needed.
     pub without_events: Option<String>,
     /// Why deliveries of messages are not followed although they are needed.
     pub without_deliveries: Option<String>,

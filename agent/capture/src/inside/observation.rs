@@ -449,7 +449,7 @@ impl Observation {
             is_idle: self.is_resting,
             shows_rates: self.rounds >= RATE_ROUNDS,
             late: self.late.observed(),
-            without_events: self.late.without_events().map(str::to_owned),
+            without_events: self.late.without_events(),
             without_deliveries: self.late.without_deliveries().map(str::to_owned),
             counters: labels.zip(values).collect(),
         });

@@ -218,6 +218,12 @@ impl Programs {
         Ok(Attached::new(self.breakpoints.attach_here(calls, file)?))
     }
 
+    /// Returns why this kernel refused the programs at the scheduler's events.
+    pub(super) fn without_scheduler(&self) -> Option<Reason> {
+        let refused = self.scheduler.as_ref().err();
+        refused.map(|error| Reason::of(error))
+    }
+
     /// Runs the programs at the scheduler's events.
     ///
     /// # Errors

@@ -17,6 +17,8 @@ const MOUNTS_PATH: &str = "/proc/self/mountinfo";
 const LIMITS_PATH: &str = "/proc/self/limits";
 /// Oldest release on which the filter passes the verifier.
 const OLDEST_RELEASE: (u32, u32) = (5, 10);
+/// Oldest release that shows which threads ran instead of late calls.
+const LATE_CAUSES: (u32, u32) = (5, 15);
 /// First release that does not charge BPF maps to locked memory.
 const NO_MEMLOCK: (u32, u32) = (5, 11);
 /// Size of the rings and tables of one source with a margin, in bytes.
@@ -49,7 +51,11 @@ fn version(release: &Result<String, ReadFailure>) -> Finding {
             .seen(error.to_string(), RELEASE_PATH)
             .remedy("uname -r"),
         Ok(text) => match parse(text) {
-            Some(own) if own >= OLDEST_RELEASE => report(Severity::Ok, format!("Linux {text}")),
+            Some(own) if own >= LATE_CAUSES => report(Severity::Ok, format!("Linux {text}")),
+            Some(own) if own >= OLDEST_RELEASE => report(
+                Severity::Note,
+                format!("Linux {text} does not show what ran instead of late calls: 5.15 does"),
+            ),
             Some(_) => report(
                 Severity::Problem,
                 format!("Linux {text} is too old: live capture needs 5.10 or newer"),
@@ -74,8 +80,8 @@ fn types(host: &HostState) -> Finding {
         )
         .seen("there", BTF_PATH);
     }
-    let sentence = "the kernel has no type information (BTF): socket owners and messages lost in \
-        reassembly are unknown";
+    let sentence = "the kernel has no type information (BTF): socket owners, messages lost in \
+        reassembly and what ran instead of late calls are unknown";
     Finding::new(AREA, "types", Severity::Warning, sentence)
         .seen("not there", BTF_PATH)
         .elsewhere("CONFIG_DEBUG_INFO_BTF=y    # in the kernel's configuration")
@@ -313,7 +319,8 @@ mod tests {
     #[test]
     fn missing_kernel_features_are_reported() {
         gives((RELEASE_PATH, "5.4.0-42"), "version", Severity::Problem);
-        gives((RELEASE_PATH, "5.10.120-tegra"), "version", Severity::Ok);
+        gives((RELEASE_PATH, "5.10.120-tegra"), "version", Severity::Note);
+        gives((RELEASE_PATH, "5.15.0-91"), "version", Severity::Ok);
         gives((RELEASE_PATH, "new"), "version", Severity::Unknown);
         gives((RELEASE_PATH, "gone"), "version", Severity::Unknown);
         gives((BTF_PATH, "gone"), "types", Severity::Warning);

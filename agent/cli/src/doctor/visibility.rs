@@ -188,6 +188,7 @@ const fn words(ability: Ability) -> &'static str {
         Ability::SharedMemory => "Fast DDS's shared memory, in samples",
         Ability::SharedMemoryExact => "each message in Fast DDS's shared memory",
         Ability::Inside => "counts from inside processes, whatever the transport",
+        Ability::LateCauses => "all causes of late calls",
     }
 }
 
@@ -247,6 +248,9 @@ fn missing_ability_finding(visibility: &Visibility, ability: Ability) -> Option<
                 .to_owned(),
             Some("capture: {inside: topics}    # always; with auto while `rp inside` runs"),
         ),
+        // Otherwise causes are observed while a client requests them, or late calls are off.
+        Ability::LateCauses if reason.is_none() => return None,
+        Ability::LateCauses => (Severity::Note, format!("not {}", words(ability)), None),
         _ => (Severity::Warning, format!("not {}", words(ability)), None),
     };
     // An agent has a reason only if its configuration is already that of the remedy.
@@ -341,6 +345,23 @@ mod tests {
         let unavailable = &find(&findings, "inside").unwrap().sentence;
         let reason = "are not counted: it lacks CAP_SYS_ADMIN";
         assert!(unavailable.ends_with(reason), "{unavailable}");
+    }
+
+    #[test]
+    fn missing_causes_of_late_calls_are_reported_only_with_their_reason() {
+        let mut able = Ability::ALL.to_vec();
+        able.retain(|each| *each != Ability::LateCauses);
+        let mut visibility = host(&able);
+        assert!(find(&check(&visibility), "late_causes").is_none());
+        let reason = "the kernel has no types".to_owned();
+        visibility.reasons = vec![(Ability::LateCauses, reason)];
+        let findings = check(&visibility);
+        let found = find(&findings, "late_causes").unwrap();
+        assert_eq!(found.severity, Severity::Note);
+        assert_eq!(
+            found.sentence,
+            "not all causes of late calls: the kernel has no types"
+        );
     }
 
     #[test]

@@ -445,6 +445,12 @@ fn abilities(live: &LiveSource) -> Vec<Ability> {
     if is_observed && !is_stalled(Part::Inside) {
         abilities.push(Ability::Inside);
     }
+    let has_causes = |facts: InsideSourceFacts| {
+        facts.late == "events" && facts.reason_off.is_none() && facts.without_causes().is_none()
+    };
+    if self::inside(live).is_some_and(has_causes) {
+        abilities.push(Ability::LateCauses);
+    }
     abilities
 }
 
@@ -452,9 +458,14 @@ fn abilities(live: &LiveSource) -> Vec<Ability> {
 fn on_demand(live: &LiveSource) -> Vec<Ability> {
     let is_exact_resting = live.exact().is_some_and(|facts| facts.is_resting);
     let is_inside_resting = live.inside().is_some_and(|facts| facts.is_idle);
+    let is_at_sums =
+        |facts: InsideSourceFacts| facts.late == "sums" && facts.without_causes().is_none();
     let abilities = [
         is_exact_resting.then_some(Ability::SharedMemoryExact),
         is_inside_resting.then_some(Ability::Inside),
+        inside(live)
+            .is_some_and(is_at_sums)
+            .then_some(Ability::LateCauses),
     ];
     abilities.into_iter().flatten().collect()
 }
@@ -477,8 +488,11 @@ fn blind(live: &LiveSource) -> Vec<(Ability, String)> {
     let shared_memory = stalled(live, Part::SharedMemory);
     blind.extend(shared_memory.map(|reason| (Ability::SharedMemory, reason)));
     let inside = live.without_inside().map(str::to_owned);
-    let inside = inside.or_else(|| self::inside(live)?.reason_off);
+    let observed = self::inside(live).unwrap_or_default();
+    let causes = observed.without_causes().map(str::to_owned);
+    let inside = inside.or(observed.reason_off);
     blind.extend(inside.map(|reason| (Ability::Inside, reason)));
+    blind.extend(causes.map(|reason| (Ability::LateCauses, reason)));
     blind
 }
 

@@ -203,15 +203,10 @@ fn why<'a>(
         timestamp_seconds: snapshot.time().seconds(),
         observed: Cow::Borrowed(source.map_or("off", |source| source.late)),
         reason: source.and_then(|source| {
-            // Where late calls are off, nothing is missing for them.
-            let without_deliveries = source.without_deliveries.as_ref();
-            let without_deliveries = without_deliveries.filter(|_| source.late != "off");
-            let reason = source
-                .reason_off
-                .as_ref()
-                .or(source.without_events.as_ref())
-                .or(without_deliveries);
-            Some(Cow::Borrowed(reason?.as_str()))
+            let reason_off = source.reason_off.as_deref();
+            reason_off
+                .or_else(|| source.without_causes())
+                .map(Cow::Borrowed)
         }),
         ..Why::default()
     };
@@ -421,6 +416,31 @@ mod tests {
         assert_eq!(listed(&snapshot, minute, true), [call]);
         snapshot.at = snapshot.at + Duration::from_secs(61);
         assert_eq!(listed(&snapshot, minute, true), []);
+    }
+
+    #[test]
+    fn the_answer_names_what_is_missing_for_causes() {
+        let snapshot = sample_robot::snapshot(["/points"]);
+        let reason = |source: &InsideSourceFacts| {
+            let selection = Selection {
+                last: None,
+                has_history: false,
+            };
+            let answer = why(&snapshot, Some(source), selection, |_| true);
+            answer.reason.map(Cow::into_owned)
+        };
+        let mut source = InsideSourceFacts {
+            late: "off",
+            without_deliveries: Some("no sockets".to_owned()),
+            ..InsideSourceFacts::default()
+        };
+        assert_eq!(reason(&source), None, "no late calls are reported");
+        source.late = "sums";
+        assert_eq!(reason(&source).as_deref(), Some("no sockets"));
+        source.without_events = Some("needs Linux 5.15".to_owned());
+        assert_eq!(reason(&source).as_deref(), Some("needs Linux 5.15"));
+        source.reason_off = Some("no broker".to_owned());
+        assert_eq!(reason(&source).as_deref(), Some("no broker"));
     }
 
     #[test]

@@ -148,7 +148,10 @@ fn unseen(agent: &AgentFacts) -> Vec<Finding> {
         }
         let mut blind = agent.missing_abilities.iter();
         let Some((_, reason)) = blind.find(|(blind, _)| *blind == ability) else {
-            lacking.push(object(ability));
+            // Otherwise causes are observed while a client requests them, or late calls are off.
+            if ability != Ability::LateCauses {
+                lacking.push(object(ability));
+            }
             continue;
         };
         let text = format!("The agent does not see {}: {reason}", object(ability));
@@ -179,6 +182,7 @@ const fn object(ability: Ability) -> &'static str {
         Ability::SharedMemory => "messages through shared memory",
         Ability::SharedMemoryExact => "each single message through shared memory",
         Ability::Inside => "messages that only calls inside processes show",
+        Ability::LateCauses => "all causes of late calls",
     }
 }
 
@@ -679,6 +683,11 @@ mod tests {
             both[0],
             "The agent does not see losses in the buffers of sockets: the kernel is too old"
         );
+        let reason = "it has no types".to_owned();
+        agent.missing_abilities.push((Ability::LateCauses, reason));
+        let causes = "The agent does not see all causes of late calls: it has no types";
+        assert!(text(&agent).iter().any(|note| note == causes));
+        agent.missing_abilities.pop();
         assert!(both.len() == 2 && !both[1].contains("buffers"), "{both:?}");
         agent.abilities = Ability::ALL.to_vec();
         assert!(text(&agent).is_empty());
