@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use jiff::Timestamp;
 use jiff::tz::TimeZone;
-use ros2probe_api::why::{LateCall, LateCallback, OtherThread, Part, Why};
+use ros2probe_api::why::{LateCall, LateCallSummary, LateCallback, OtherThread, Part, Why};
 
 use crate::top::text::{counted, escaped, seconds};
 
@@ -22,10 +22,58 @@ const STAGES: [(&str, &str); 6] = [
 /// Share of a call below which a part has no words.
 const MIN_NAMED_SHARE: f64 = 0.005;
 
+/// Time before and after a moment in which late calls belong to it, in seconds.
+pub const AROUND: f64 = 5.0;
+
 /// Returns whether no late call is known.
 #[must_use]
 pub fn is_empty(why: &Why<'_>) -> bool {
     why.callbacks.is_empty()
+}
+
+/// Keeps the late calls [`AROUND`] a Unix time, of an answer with `history=true`.
+pub fn keep_around(why: &mut Why<'_>, moment: f64) {
+    let is_around = |at: f64| (at - moment).abs() <= AROUND;
+    let mut kept = Vec::new();
+    for callback in &mut why.callbacks {
+        add_examples_to_history(callback);
+        let history = &mut callback.history;
+        history.retain(|call| is_around(call.timestamp_seconds));
+        kept.extend(history.iter().cloned());
+        (callback.calls, callback.late_calls) = (None, history.len() as u64);
+        let examples = &mut callback.examples;
+        examples.retain(|call| is_around(call.timestamp_seconds));
+    }
+    why.callbacks.retain(|callback| callback.late_calls > 0);
+    for cause in &mut why.causes {
+        let key = (&cause.stage, &cause.words);
+        let calls = kept.iter().filter(|call| (&call.stage, &call.words) == key);
+        let totals: Vec<_> = calls.map(|call| call.total_seconds).collect();
+        cause.late_calls = totals.len() as u64;
+        cause.longest_seconds = totals.into_iter().fold(0.0, f64::max);
+    }
+    why.causes.retain(|cause| cause.late_calls > 0);
+    why.causes
+        .sort_by_key(|cause| std::cmp::Reverse(cause.late_calls));
+}
+
+/// Adds the examples that are older than the history of their callback.
+fn add_examples_to_history(callback: &mut LateCallback<'_>) {
+    let history = &mut callback.history;
+    for call in &callback.examples {
+        let is_same =
+            |of: &LateCallSummary<'_>| (of.timestamp_seconds - call.timestamp_seconds).abs() < 1e-6;
+        if !history.iter().any(is_same) {
+            history.push(LateCallSummary {
+                timestamp_seconds: call.timestamp_seconds,
+                total_seconds: call.wait_seconds.unwrap_or_default() + call.duration_seconds,
+                stage: call.stage.clone().unwrap_or_default(),
+                cause: call.cause.clone().unwrap_or_default(),
+                words: call.words.clone(),
+            });
+        }
+    }
+    history.sort_by(|one, other| one.timestamp_seconds.total_cmp(&other.timestamp_seconds));
 }
 
 /// Returns the text: the causes by their number of calls, then each callback with its worst call.
@@ -65,6 +113,15 @@ fn write_callback(callback: &LateCallback<'_>, zone: &TimeZone, out: &mut String
         "{node}, callback of {}: {calls}",
         escaped(&callback.trigger.words())
     );
+    for call in &callback.history {
+        let _ = writeln!(
+            out,
+            "  {} {:>6}: {}",
+            time(call.timestamp_seconds, zone),
+            seconds(call.total_seconds),
+            escaped(&call.words)
+        );
+    }
     if let Some(worst) = callback.examples.first() {
         write_worst_call(worst, zone, out);
     }
@@ -303,6 +360,51 @@ mod tests {
   longest blocked: 20ms in futex(0x7f00)
 ";
         assert_eq!(text, expected);
+    }
+
+    /// A late call that began some seconds after that of [`why`].
+    fn later(after: f64, words: &'static str) -> LateCallSummary<'static> {
+        LateCallSummary {
+            timestamp_seconds: 1_700_000_000.25 + after,
+            total_seconds: 0.05,
+            words: words.into(),
+            ..LateCallSummary::default()
+        }
+    }
+
+    #[test]
+    fn the_late_calls_around_a_moment_are_listed_with_their_causes_alone() {
+        let mut all = why();
+        let computed = Cause {
+            late_calls: 9,
+            words: "it computed".into(),
+            ..Cause::default()
+        };
+        all.causes.push(computed);
+        all.callbacks[0].history = vec![
+            later(20.0, "it computed"),
+            later(21.0, "it computed"),
+            later(40.0, "it slept"),
+        ];
+        let of = |after: f64| {
+            let mut some = all.clone();
+            keep_around(&mut some, 1_700_000_000.25 + after);
+            some
+        };
+        let some = of(23.0);
+        let words: Vec<_> = some.causes.iter().map(|cause| &*cause.words).collect();
+        assert_eq!((words, some.causes[0].late_calls), (vec!["it computed"], 2));
+        let listed = text(&some, &TimeZone::UTC);
+        let expected = "   2 of 2, up to 50ms: it computed
+     > \n\n/filter, callback of /points: 2 late calls
+  22:13:40.250   50ms: it computed
+  22:13:41.250   50ms: it computed\n";
+        assert_eq!(listed, expected);
+        // The worst call is older than the history.
+        let worst = text(&of(1.0), &TimeZone::UTC);
+        let line = "  22:13:20.250  160ms: its control group had used up its CPU quota\n  worst: ";
+        assert!(worst.contains(line), "{worst}");
+        assert!(is_empty(&of(10.0)) && of(10.0).causes.is_empty());
     }
 
     #[test]

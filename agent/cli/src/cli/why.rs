@@ -5,8 +5,9 @@ use std::time::{Duration, Instant};
 
 use anyhow::Result;
 use clap::Args;
-use jiff::SignedDuration;
+use jiff::civil::Time;
 use jiff::tz::TimeZone;
+use jiff::{SignedDuration, Zoned};
 use ros2probe::client::{Agent, Target};
 use ros2probe::why;
 use ros2probe_api::path::encoded;
@@ -39,6 +40,7 @@ Examples:
   rp why
   rp why /cmd_vel --above 20
   rp why --node /controller --last 10m
+  rp why /cmd_vel --at 12:36:04
   rp why --chain /points /cmd_vel
   rp why /scan --json | jq '.callbacks[].examples[0].parts'")]
 pub(crate) struct Why {
@@ -57,6 +59,9 @@ pub(crate) struct Why {
     /// Only late calls of this last time, e.g. 10m or 90s [default: all that are known]
     #[arg(long, value_name = "TIME")]
     last: Option<SignedDuration>,
+    /// List each late call around this time of the last 24 hours, e.g. 12:36:04
+    #[arg(long, value_name = "HH:MM:SS", conflicts_with_all = ["last", "above"])]
+    at: Option<Time>,
     /// Maximum time to wait for a late call, in seconds; 0 = do not wait
     #[arg(long, value_name = "S", default_value_t = 30)]
     wait: u64,
@@ -73,13 +78,18 @@ impl Why {
         let begin = Instant::now();
         let end = Instant::now() + Duration::from_secs(self.wait);
         let mut has_said = false;
+        let at = self.at.map(|at| latest(at, &Zoned::now())).transpose()?;
         let answer = loop {
             let now = Instant::now();
             let path = self.path(now.saturating_duration_since(begin))?;
-            let answer: Answer<'static> = match self.json {
+            let mut answer: Answer<'static> = match self.json {
                 true => agent.get(&path)?,
                 false => agent.get_visible(&path)?,
             };
+            if let Some(at) = at {
+                why::keep_around(&mut answer, at);
+                break answer;
+            }
             if !why::is_empty(&answer) || answer.observed == "off" || now >= end {
                 break answer;
             }
@@ -109,6 +119,9 @@ impl Why {
         if let Some([from, to]) = self.chain.as_deref() {
             parameters.push(format!("from={}&to={}", encoded(from), encoded(to)));
         }
+        if self.at.is_some() {
+            parameters.push("history=true".to_owned());
+        }
         if let Some(above) = self.above {
             parameters.push(format!("above_ms={above}"));
         }
@@ -134,6 +147,12 @@ impl Why {
             let reason = reason.unwrap_or("capture.inside or capture.late is off");
             return format!("callbacks are not observed: {reason}");
         }
+        if let Some(at) = self.at {
+            let seconds = why::AROUND;
+            return format!(
+                "no late call is known from {seconds} s before to {seconds} s after {at}"
+            );
+        }
         let name = self.name.as_ref().or(self.node.as_ref());
         match (name, self.chain.as_deref()) {
             (Some(name), _) => format!("no call of a callback of {name} was late (see --above)"),
@@ -143,6 +162,18 @@ impl Why {
             (None, _) => "no call of a callback was late (see --above)".to_owned(),
         }
     }
+}
+
+/// Returns the last time before `now` at which the clock showed `at`, in Unix seconds.
+fn latest(at: Time, now: &Zoned) -> Result<f64, jiff::Error> {
+    let mut moment = now
+        .date()
+        .to_datetime(at)
+        .to_zoned(now.time_zone().clone())?;
+    if moment > *now {
+        moment = moment.yesterday()?;
+    }
+    Ok(moment.timestamp().as_duration().as_secs_f64())
 }
 
 fn milliseconds(text: &str) -> Result<f64, UserError> {
@@ -158,7 +189,20 @@ const fn whole_seconds(duration: Duration) -> u128 {
 
 #[cfg(test)]
 mod tests {
+    use jiff::civil::date;
+
     use super::*;
+
+    #[test]
+    fn a_time_of_day_is_the_last_one() {
+        let noon = date(2026, 11, 30).at(12, 0, 0, 0);
+        let now = noon.to_zoned(TimeZone::UTC).unwrap();
+        let ago = |at: &str| {
+            let at = latest(at.parse().unwrap(), &now).unwrap();
+            now.timestamp().as_duration().as_secs_f64() - at
+        };
+        assert_eq!([ago("11:59:30"), ago("12:00:01")], [30.0, 86_399.0]);
+    }
 
     #[test]
     fn a_wait_of_less_than_a_second_is_no_wait_of_zero_seconds() {

@@ -7,6 +7,7 @@ use std::process::Command;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context as _, Result, ensure};
+use jiff::tz::TimeZone;
 use ros2probe_api::chains::{Chain, ChainList};
 use ros2probe_api::inside::Inside;
 use ros2probe_api::why::{LateCallback, Why};
@@ -403,6 +404,11 @@ fn a_sleeping_call_is_late_with_its_cause_from_the_first_request_on() -> Result<
         blocked.system_call.as_deref() == Some("clock_nanosleep"),
         "{call:?}"
     );
+    // The same call by its time.
+    let zone = TimeZone::system();
+    let at = ros2probe::why::time(call.timestamp_seconds, &zone);
+    let text = ask(&format!("/robot1/filter --at {at}"))?;
+    ensure!(text.contains(&format!("  {at} ")), "{at}: {text}");
     let none = why("/another")?;
     ensure!(
         none.callbacks.is_empty() && none.causes.is_empty(),

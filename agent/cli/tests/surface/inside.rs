@@ -278,7 +278,13 @@ fn without_the_source_no_call_is_late_and_the_command_prints_the_reason() {
     let answer: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
     assert_eq!(answer["callbacks"], serde_json::json!([]));
     assert_eq!(run(&["/a", "--chain", "/b", "/c"]).status.code(), Some(2));
-    for wrong in [["--above", "-1"], ["--above", "x"], ["--last", "soon"]] {
+    assert_eq!(run(&["--at", "12:36:04"]).status.code(), Some(1));
+    for wrong in [
+        ["--above", "-1"],
+        ["--above", "x"],
+        ["--last", "soon"],
+        ["--at", "noon"],
+    ] {
         let output = run(&[&format!("{}={}", wrong[0], wrong[1])]);
         assert_eq!(output.status.code(), Some(2), "{wrong:?}");
     }
