@@ -170,6 +170,17 @@ const ON_THE_WAY: [Injected; 3] = [
     },
 ];
 
+/// The same with Zenoh: routers pass messages on, so that their way is not known.
+const BETWEEN_ROUTERS: [Injected; 1] = [Injected {
+    bytes: 8_000,
+    ..before(
+        "delay",
+        Beside::SlowLink,
+        &["wait"],
+        ("arrival", "the executor waited for it"),
+    )
+}];
+
 #[test]
 #[ignore = "needs ROS 2 with rmw_fastrtps_cpp, ament_cmake: make test-ros2"]
 fn injected_causes_over_fast_dds_are_named() -> Result<()> {
@@ -198,6 +209,19 @@ fn injected_causes_between_hosts_of_fast_dds_are_named() -> Result<()> {
 #[ignore = "needs ROS 2 with rmw_cyclonedds_cpp, ament_cmake: make test-ros2"]
 fn injected_causes_between_hosts_of_cyclone_dds_are_named() -> Result<()> {
     names_the_causes_between_hosts(Middleware::Cyclone)
+}
+
+#[test]
+#[ignore = "needs ROS 2 with rmw_zenoh_cpp, ament_cmake: make test-ros2"]
+fn a_slow_link_between_routers_of_zenoh_is_an_arrival() -> Result<()> {
+    let link = Link::new()?;
+    let far = Host::new(&link.robot, Middleware::Zenoh)?;
+    let host = Host::new(&link.monitor, Middleware::Zenoh)?;
+    let _router = host.router_if_any()?;
+    let endpoint = format!("tcp/{}:7447", link.monitor.address());
+    let _far_router = far.router(&format!("connect/endpoints=[\"{endpoint}\"]"))?;
+    let agent = observed(&host)?;
+    Robot::start(&far, &host, &agent, "")?.names_all(&BETWEEN_ROUTERS)
 }
 
 fn names_the_causes(middleware: Middleware) -> Result<()> {
@@ -329,6 +353,7 @@ impl<'h, 'n> Robot<'h, 'n> {
         // Ordinary calls, whose delays the agent compares with.
         let nothing = injected("nothing", Beside::Nothing, "", "");
         self.inject(&nothing, 50)?;
+        self.names_nothing(&nothing)?;
         let mut failures = Vec::new();
         for injected in all {
             if let Err(error) = self.names(injected) {
@@ -336,6 +361,26 @@ impl<'h, 'n> Robot<'h, 'n> {
             }
         }
         ensure!(failures.is_empty(), "{}", failures.join("\n"));
+        Ok(())
+    }
+
+    /// Checks that ordinary calls are not late. Reports have the order of the calls: that of a later
+    /// call shows that none is outstanding.
+    fn names_nothing(&mut self, nothing: &Injected) -> Result<()> {
+        let last = injected("sleep", Beside::Nothing, "sleep", "");
+        let before = Late::read(&self.agent.scrape()?, &last);
+        self.inject(nothing, NUMBER)?;
+        self.inject(&last, 3)?;
+        let page = self.agent.scrape_until("the last calls are late", |page| {
+            Late::read(page, &last).since(&before).calls >= 3.0
+        })?;
+        let late = Late::read(&page, &last).since(&before);
+        ensure!(
+            late.calls == late.of_cause + late.busy,
+            "{} late calls, {} by a busy machine, 3 injected",
+            late.calls,
+            late.busy
+        );
         Ok(())
     }
 

@@ -129,6 +129,23 @@ fn a_call_that_computes_names_no_one() {
 }
 
 #[test]
+fn calls_within_the_bound_name_nothing() {
+    let (mut robot, mut process) = started();
+    robot.round();
+    let calls = late(&mut robot, &mut process, "compute 300 50");
+    // On a busy machine, another thread may run instead for longer than the bound.
+    for call in calls.iter().filter(|call| is_complete(call)) {
+        let main = call.main_part(ThreadStates::default()).unwrap();
+        assert!(is_busy(&main), "{call:#?}");
+    }
+    // Late calls are still reported.
+    let begun = Instant::now();
+    while late(&mut robot, &mut process, "sleep 1 20000").is_empty() {
+        assert!(begun.elapsed() < PATIENCE);
+    }
+}
+
+#[test]
 fn a_call_beside_a_busy_thread_names_that_thread() {
     let (mut robot, mut process) = started();
     pin(&process);
