@@ -71,6 +71,8 @@ fn requires_causes(kind: &EventKind) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use ros2probe_model::facts::diagnosis::TopicKey;
+    use ros2probe_model::facts::topic_kind::TopicKind;
     use ros2probe_wire::DomainId;
     use ros2probe_wire::Timestamp;
 
@@ -103,5 +105,37 @@ mod tests {
         causes.note(&[event(WatchState::Ok, WatchState::Violated)], now);
         assert!(is_required(&causes, 0) && is_required(&causes, 59));
         assert!(!is_required(&causes, 60));
+    }
+
+    #[test]
+    fn a_slow_chain_requires_causes_until_it_is_resolved_and_other_findings_do_not() {
+        let topic = TopicKey {
+            domain_id: DomainId(0),
+            dds_name: "rt/cmd_vel".into(),
+            name: "/cmd_vel".into(),
+            kind: TopicKind::Topic,
+        };
+        let other = Diagnosis::RestampingNode {
+            topic: topic.clone(),
+            node: "/driver".into(),
+            input: "/scan".into(),
+        };
+        let slow = Diagnosis::SlowChain {
+            topic,
+            from: "/scan".into(),
+            max_latency: Duration::from_millis(20),
+        };
+        let is_required = |resolved, finding: &Diagnosis| {
+            let (mut causes, now) = (CauseDemand::default(), Instant::now());
+            let finding = finding.clone();
+            let kind = EventKind::Diagnosis { resolved, finding };
+            let at = Timestamp(0);
+            causes.note(&[Event { at, kind }], now);
+            let mut demand = LateDemand::default();
+            causes.add_to(&mut demand, now);
+            demand.has_question
+        };
+        assert!(is_required(false, &slow));
+        assert!(!is_required(true, &slow) && !is_required(false, &other));
     }
 }
