@@ -325,10 +325,12 @@ late_causes() {
     figure=$(echo "$why" | jq -r '[.causes[] | "\(.late_calls) \(.cause)"] | join(", ")')
     reason=$(echo "$why" | jq -r '.reason // empty')
     figure="$figure${reason:+: $reason}"
+    missing=$(curl -s --max-time 5 http://127.0.0.1:17401/health |
+        jq -r '.abilities[] | select(.ability == "late_causes") | .reason // empty')
     cp config.before $config
     restart
     if [ -n "$reason" ]; then
-        echo "$figure" | grep -q blocked
+        [ "$missing" = "$reason" ] && echo "$figure" | grep -q blocked
     else
         echo "$figure" | grep sleep | grep -q lock
     fi
