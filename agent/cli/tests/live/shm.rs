@@ -176,7 +176,8 @@ fn a_topic_of_two_middlewares_with_a_remote_subscriber_has_all_its_sources() -> 
     println!("{}", shared_memory_metrics(&page));
     assert_eq!(more("/imu"), 200.0, "{}", shared_memory_metrics(&page));
     assert_eq!(more("/points"), 200.0);
-    assert!(shows_all_pairs(&page), "{}", page.0);
+    // The announcement of an idle peer may be later than its lease on a busy machine.
+    agent.scrape_until("all pairs", shows_all_pairs)?;
     for topic in ["/imu", "/points"] {
         assert_eq!(page.sum("ros2_topic_publishers", &[("topic", topic)]), 1.0);
     }
