@@ -81,6 +81,15 @@ pub struct ShmSettings {
     pub reading_cpu_percent: f64,
 }
 
+impl ShmSettings {
+    /// Returns whether programs read every message in the processes that send it, always or on
+    /// demand.
+    #[must_use]
+    pub const fn reads_in_senders(&self) -> bool {
+        matches!(self.mode, ShmMode::Auto) && !matches!(self.exact, ExactChoice::Off)
+    }
+}
+
 /// Whether shared memory is read.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]

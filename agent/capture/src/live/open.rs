@@ -71,7 +71,7 @@ pub(super) fn open_exact(
     settings: &CaptureSettings,
     host: bool,
 ) -> (Option<Uprobe>, Option<String>) {
-    if settings.shm.exact == ExactChoice::Off {
+    if !settings.shm.reads_in_senders() {
         return (None, None);
     }
     if !host {
@@ -148,4 +148,46 @@ pub(super) fn open_wires(
         wires.push(netns::within(path, open)??);
     }
     Ok(wires)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::settings::{ShmMode, ShmSettings, WireChoice};
+
+    #[test]
+    fn no_program_for_shared_memory_is_loaded_where_it_is_off() {
+        let settings = |mode, exact| CaptureSettings {
+            source: SourceChoice::Host,
+            wire: WireChoice::default(),
+            cgroup: None,
+            mirror_interfaces: Vec::new(),
+            include_interfaces: Vec::new(),
+            exclude_interfaces: Vec::new(),
+            network_namespaces: Vec::new(),
+            ring_bytes: 1 << 20,
+            record_ring_bytes: 1 << 20,
+            shm: ShmSettings {
+                mode,
+                exact,
+                cpu_percent: 1.0,
+                reading_cpu_percent: 1.0,
+            },
+            inside: InsideChoice::Off,
+            late: LateChoice::Off,
+            broker: PathBuf::new(),
+            zenoh_ports: Vec::new(),
+        };
+        for (mode, exact) in [
+            (ShmMode::Off, ExactChoice::Auto),
+            (ShmMode::Off, ExactChoice::Uprobe),
+            (ShmMode::Auto, ExactChoice::Off),
+        ] {
+            let (programs, reason) = open_exact(&settings(mode, exact), true);
+            assert!(programs.is_none() && reason.is_none(), "{mode:?} {exact:?}");
+        }
+        // Without the host's sockets, the reason is reported before a program is loaded.
+        let (programs, reason) = open_exact(&settings(ShmMode::Auto, ExactChoice::Auto), false);
+        assert!(programs.is_none() && reason.is_some());
+    }
 }

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use anyhow::Result;
 use ros2probe_capture::live::LiveSource;
 use ros2probe_capture::reassembly::Limits;
-use ros2probe_daemon::config::{CaptureSettings, ShmMode, SourceChoice};
+use ros2probe_daemon::config::{CaptureSettings, InsideChoice, ShmMode, SourceChoice};
 use ros2probe_daemon::privilege;
 use ros2probe_model::graph::discovery::hexadecimal;
 use ros2probe_model::observe::input::Input;
@@ -113,6 +113,7 @@ impl FoundParticipant {
 fn capture(mut configured: CaptureSettings, interface: Option<&str>) -> CaptureSettings {
     // Participants announce themselves on the network.
     configured.shm.mode = ShmMode::Off;
+    configured.inside = InsideChoice::Off;
     let Some(interface) = interface else {
         return configured;
     };
@@ -129,6 +130,16 @@ fn capture(mut configured: CaptureSettings, interface: Option<&str>) -> CaptureS
 #[cfg(test)]
 mod tests {
     use super::*;
+    use ros2probe_daemon::config::Config;
+
+    #[test]
+    fn listening_loads_no_program_for_other_processes() {
+        for interface in [None, Some("eth0")] {
+            let capture = capture(Config::default().capture, interface);
+            assert!(!capture.shm.reads_in_senders());
+            assert_eq!(capture.inside, InsideChoice::Off);
+        }
+    }
 
     #[test]
     fn a_participant_can_be_named_as_in_the_metrics() {

@@ -8,7 +8,7 @@ use ros2probe_api::doctor::{Area, Finding, Severity};
 use ros2probe_api::health::Health;
 use ros2probe_capture::container::is_container;
 use ros2probe_capture::uprobe;
-use ros2probe_daemon::config::{CaptureSettings, ExactChoice, InsideChoice, ShmMode};
+use ros2probe_daemon::config::{CaptureSettings, InsideChoice};
 use ros2probe_daemon::container::Restriction;
 use ros2probe_daemon::privilege;
 
@@ -150,7 +150,7 @@ const ENABLE_BROKER: &str = "sudo systemctl unmask ros2probe-attach.socket; sudo
 
 /// Returns the finding for uprobes, if they are configured.
 fn probes(host: &HostState, settings: &CaptureSettings) -> Option<Finding> {
-    let is_exact = settings.shm.mode != ShmMode::Off && settings.shm.exact != ExactChoice::Off;
+    let is_exact = settings.shm.reads_in_senders();
     let is_inside = settings.inside != InsideChoice::Off;
     let keys = match (is_exact, is_inside) {
         (false, false) => return None,
@@ -249,7 +249,7 @@ mod tests {
 
     use super::super::host_state::tests::host;
     use super::*;
-    use ros2probe_daemon::config::Config;
+    use ros2probe_daemon::config::{Config, ExactChoice};
 
     const INSTALLED: (&str, &str) = ("/usr/lib/systemd/system/ros2probe.service", "[Unit]");
     const BOOTED: (&str, &str) = ("/run/systemd/system/x", "");

@@ -4,7 +4,7 @@
 use ros2probe_api::doctor::{Area, Finding, Severity};
 use ros2probe_api::health::Health;
 use ros2probe_daemon::agent_facts::{Ability, AgentFacts};
-use ros2probe_daemon::config::{CaptureSettings, ExactChoice, InsideChoice};
+use ros2probe_daemon::config::{CaptureSettings, InsideChoice};
 
 const AREA: Area = Area::Sight;
 /// Source of facts about a running agent.
@@ -60,7 +60,10 @@ impl Visibility {
     pub fn of_trial(facts: AgentFacts, settings: &CaptureSettings) -> Self {
         let is_inside = matches!(settings.inside, InsideChoice::Topics | InsideChoice::Full);
         let untried = [
-            (settings.shm.exact != ExactChoice::Off).then_some(Ability::SharedMemoryExact),
+            settings
+                .shm
+                .reads_in_senders()
+                .then_some(Ability::SharedMemoryExact),
             is_inside.then_some(Ability::Inside),
         ];
         Self {
@@ -274,7 +277,7 @@ mod tests {
     use super::*;
     use ros2probe_api::doctor::RemedyTarget;
     use ros2probe_daemon::agent_facts::SourceKind;
-    use ros2probe_daemon::config::Config;
+    use ros2probe_daemon::config::{Config, ExactChoice, ShmMode};
 
     fn host(able: &[Ability]) -> Visibility {
         Visibility {
@@ -316,6 +319,9 @@ mod tests {
         let mut settings = Config::default().capture;
         assert_eq!(settings.shm.exact, ExactChoice::Auto);
         assert_eq!(missing(&settings), [false, true]);
+        settings.shm.mode = ShmMode::Off;
+        assert_eq!(missing(&settings), [true, true]);
+        settings.shm.mode = ShmMode::Auto;
         settings.shm.exact = ExactChoice::Off;
         settings.inside = InsideChoice::Full;
         assert_eq!(missing(&settings), [true, false]);
