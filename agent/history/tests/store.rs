@@ -156,8 +156,8 @@ fn blocks_across_the_border_of_ten_minutes_lose_nothing() {
 #[test]
 fn the_oldest_history_is_deleted_beyond_the_limit_and_tens_reach_further() {
     let directory = tempfile::tempdir().unwrap();
-    let limit = 600 << 10;
-    let store = filled(directory.path(), limit, 0..20_000);
+    let limit = 120 << 10;
+    let store = filled(directory.path(), limit, 0..4_000);
     let size: u64 = files(directory.path())
         .iter()
         .map(|file| file.metadata().unwrap().len())
@@ -166,7 +166,7 @@ fn the_oldest_history_is_deleted_beyond_the_limit_and_tens_reach_further() {
     assert_eq!((facts.bytes, facts.limit), (size, limit));
     assert!(size <= limit && size > limit / 2, "{size}");
     let (seconds, tens) = (facts.seconds.unwrap(), facts.tens.unwrap());
-    assert_eq!(seconds.end, 1_200_000);
+    assert_eq!(seconds.end, 240_000);
     assert!(tens.begin < seconds.begin && seconds.begin > 0, "{facts:?}");
     // Older rows than those of seconds come from the tens, without a gap or an overlap.
     let (border, end) = (seconds.begin, seconds.begin + 100);

@@ -33,6 +33,8 @@ pub struct Archive {
     settings: StoreSettings,
     prefix: Path,
     place: Place,
+    /// Maximum number of objects that one listing reads.
+    max_objects: usize,
 }
 
 enum Place {
@@ -127,6 +129,7 @@ impl Archive {
             prefix: settings.prefix()?,
             settings,
             place,
+            max_objects: MAX_OBJECTS,
         })
     }
 
@@ -146,7 +149,9 @@ impl Archive {
         let store = match &mut self.place {
             Place::Folder(folder) => {
                 let robot = robot.map(|robot| Path::ROOT.join(robot).to_string());
-                return in_folder(folder, move |folder| list(&folder.path, robot.as_deref())).await;
+                let max = self.max_objects;
+                let work = move |folder: &Folder| list(&folder.path, robot.as_deref(), max);
+                return in_folder(folder, work).await;
             }
             Place::Store(Some(store)) => {
                 store.reload_credentials()?;
@@ -172,7 +177,7 @@ impl Archive {
                 add(&mut found, &self.prefix, &object);
             }
             token = next;
-            if token.is_none() || count >= MAX_OBJECTS {
+            if token.is_none() || count >= self.max_objects {
                 return Ok(listing(found, token.is_some()));
             }
         }
@@ -272,21 +277,21 @@ impl FolderPlace {
     }
 }
 
-/// Lists the bags in a folder.
-fn list(root: &FilePath, robot: Option<&str>) -> io::Result<Listing> {
+/// Lists at most `max` bags in a folder.
+fn list(root: &FilePath, robot: Option<&str>, max: usize) -> io::Result<Listing> {
     let mut found = Found::new();
     let mut count = 0;
-    for robot_entry in names(root)? {
+    for robot_entry in names(root, max)? {
         if robot.is_some_and(|robot| robot != robot_entry) {
             continue;
         }
         // A robot's directory may vanish, and a file beside them is none.
-        let Ok(bags) = names(&root.join(&robot_entry)) else {
+        let Ok(bags) = names(&root.join(&robot_entry), max) else {
             continue;
         };
         for bag in bags {
             count += 1;
-            if count > MAX_OBJECTS {
+            if count > max {
                 return Ok(listing(found, true));
             }
             let directory = root.join(&robot_entry).join(&bag);
@@ -320,9 +325,10 @@ fn stored(directory: &FilePath, robot: &str, name: &str) -> io::Result<Option<St
     }))
 }
 
-/// Returns the names of a directory's entries, up to the maximum number.
-fn names(directory: &FilePath) -> io::Result<Vec<String>> {
-    let entries = fs::read_dir(directory)?.take(MAX_OBJECTS);
+/// Returns the names of a directory's entries: at most one more than `max`, which shows that there
+/// are more.
+fn names(directory: &FilePath, max: usize) -> io::Result<Vec<String>> {
+    let entries = fs::read_dir(directory)?.take(max + 1);
     let names = entries.map(|entry| Ok(entry?.file_name().into_string().ok()));
     let names: io::Result<Vec<_>> = names.collect();
     Ok(names?.into_iter().flatten().collect())
@@ -448,24 +454,24 @@ mod tests {
 
     #[tokio::test]
     async fn objects_beyond_the_cap_are_not_listed() {
+        const MAX: usize = 3;
         let robots = Robots::new();
-        let robot = robots.0.path().join("r");
-        fs::create_dir(&robot).unwrap();
-        for number in 0..MAX_OBJECTS {
-            fs::create_dir(robot.join(number.to_string())).unwrap();
-        }
+        let create = |bag: &str| fs::create_dir_all(robots.0.path().join(bag)).unwrap();
         let mut archive = robots.archive();
+        assert_eq!(archive.max_objects, MAX_OBJECTS);
+        archive.max_objects = MAX;
+        for number in 0..MAX {
+            create(&format!("r/{number}"));
+        }
         let listing = archive.bags(None).await.unwrap();
-        assert_eq!(
-            (listing.unfinished, listing.is_cut),
-            (MAX_OBJECTS as u64, false)
-        );
-        fs::create_dir(robots.0.path().join("s")).unwrap();
-        fs::create_dir(robots.0.path().join("s/1")).unwrap();
+        assert_eq!((listing.unfinished, listing.is_cut), (MAX as u64, false));
+        create("s/1");
         let listing = archive.bags(None).await.unwrap();
-        assert_eq!(
-            (listing.unfinished, listing.is_cut),
-            (MAX_OBJECTS as u64, true)
-        );
+        assert_eq!((listing.unfinished, listing.is_cut), (MAX as u64, true));
+        let listing = archive.bags(Some("r")).await.unwrap();
+        assert_eq!((listing.unfinished, listing.is_cut), (MAX as u64, false));
+        create("r/more");
+        let listing = archive.bags(Some("r")).await.unwrap();
+        assert_eq!((listing.unfinished, listing.is_cut), (MAX as u64, true));
     }
 }
