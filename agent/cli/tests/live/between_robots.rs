@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use anyhow::{Result, ensure};
-use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE, at_the_sockets_of};
+use ros2probe_testing::harness::agent::{Agent, PACKETS_ALONE, datagrams_alone_of};
 use ros2probe_testing::harness::loss::Loss;
 use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
@@ -305,8 +305,8 @@ fn start<'a>(
 ) -> Result<Agent<'a>> {
     let source = match source {
         // Both robots are on one machine, so each agent observes only its own robot.
-        Source::Host => at_the_sockets_of(host),
-        Source::Wire => ON_THE_WIRE.to_owned(),
+        Source::Host => datagrams_alone_of(host),
+        Source::Wire => PACKETS_ALONE.to_owned(),
     };
     let configuration = directory.join(format!("{}.yaml", host.name()));
     let text = format!(

@@ -4,7 +4,7 @@
 use crate::browser::PAGE;
 use crate::browser::player::watch;
 use anyhow::{Context as _, Result, ensure};
-use ros2probe_testing::harness::agent::{Agent, Scrape, at_the_sockets_of, get};
+use ros2probe_testing::harness::agent::{Agent, Scrape, datagrams_alone_of, get};
 use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::harness::peer::{self, Peer, Role, Stack, Stream};
 use ros2probe_testing::harness::wait_until;
@@ -15,7 +15,7 @@ const TOPIC: &str = "/points";
 
 fn start<'a>(host: &'a Namespace, directory: &TempDir) -> Result<Agent<'a>> {
     let file = directory.path().join("ros2probe.yaml");
-    std::fs::write(&file, format!("watch: [/**]\n{}", at_the_sockets_of(host)))?;
+    std::fs::write(&file, format!("watch: [/**]\n{}", datagrams_alone_of(host)))?;
     Agent::start(host, env!("CARGO_BIN_EXE_rp"), &file)
 }
 

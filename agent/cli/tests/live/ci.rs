@@ -13,7 +13,9 @@ use quick_xml::Reader;
 use quick_xml::escape::unescape;
 use quick_xml::events::{BytesStart, Event};
 use ros2probe_testing::harness;
-use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE, at_the_sockets_of};
+use ros2probe_testing::harness::agent::{
+    Agent, PACKETS_ALONE, at_the_sockets_of, datagrams_alone_of,
+};
 use ros2probe_testing::harness::loss::Loss;
 use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream, robot};
@@ -221,7 +223,7 @@ fn lost_messages_and_a_low_rate_fail_by_the_name_of_the_topic() -> Result<()> {
     let link = Link::new()?;
     let place = Place::new(&format!(
         "{}watch:\n  - {{topic: /imu, min_rate_hz: 5000}}\n  - {{topic: /odom, publishers: 1}}\n",
-        at_the_sockets_of(&link.monitor)
+        datagrams_alone_of(&link.monitor)
     ))?;
     let stream = Stream::small(1_000_000);
     let script = format!(
@@ -263,7 +265,7 @@ fn lost_messages_and_a_low_rate_fail_by_the_name_of_the_topic() -> Result<()> {
 #[test]
 fn the_status_of_the_command_is_kept() -> Result<()> {
     let host = Namespace::isolated()?;
-    let place = Place::new(&at_the_sockets_of(&host))?;
+    let place = Place::new(&datagrams_alone_of(&host))?;
     for (script, code) in [
         ("exit 7", 7),
         ("kill -KILL $$", 137),
@@ -284,7 +286,7 @@ fn the_status_of_the_command_is_kept() -> Result<()> {
 #[test]
 fn a_bag_that_cannot_be_kept_does_not_lose_the_verdict() -> Result<()> {
     let host = Namespace::isolated()?;
-    let place = Place::new(&at_the_sockets_of(&host))?;
+    let place = Place::new(&datagrams_alone_of(&host))?;
     let bag = place.path("out/bag");
     let script = format!("mkdir {}; exit 0", bag.display());
     let mut process = place.start(&host, &[], &script)?;
@@ -300,7 +302,7 @@ fn a_bag_that_cannot_be_kept_does_not_lose_the_verdict() -> Result<()> {
 #[test]
 fn hostile_names_are_escaped_in_every_artefact() -> Result<()> {
     let link = Link::new()?;
-    let place = Place::new(ON_THE_WIRE)?;
+    let place = Place::new(PACKETS_ALONE)?;
     let script = "echo began; read line";
     let mut process = place.start(&link.monitor, &["--settle", "1"], script)?;
     process.wait_for("began", PATIENCE)?;
@@ -329,7 +331,7 @@ fn hostile_names_are_escaped_in_every_artefact() -> Result<()> {
 #[test]
 fn signals_reach_the_command_and_the_artefacts_are_written() -> Result<()> {
     let host = Namespace::isolated()?;
-    let place = Place::new(&at_the_sockets_of(&host))?;
+    let place = Place::new(&datagrams_alone_of(&host))?;
     for (signal, code) in [("INT", 42), ("TERM", 43)] {
         let script =
             "trap 'exit 42' INT; trap 'exit 43' TERM; echo began; while :; do sleep 0.1; done";
@@ -345,7 +347,7 @@ fn signals_reach_the_command_and_the_artefacts_are_written() -> Result<()> {
 #[test]
 fn children_end_with_an_rp_ci_that_is_killed() -> Result<()> {
     let host = Namespace::isolated()?;
-    let place = Place::new(&at_the_sockets_of(&host))?;
+    let place = Place::new(&datagrams_alone_of(&host))?;
     let script = "sleep 3601 & sleep 3602 & echo began; wait";
     let mut process = place.start(&host, &[], script)?;
     process.wait_for("began", PATIENCE)?;
@@ -428,7 +430,7 @@ fn a_run_with_more_messages_than_the_bag_may_hold_keeps_a_complete_bag() -> Resu
     let host = Namespace::isolated()?;
     let place = Place::new(&format!(
         "{}recordings: {{max_bytes: 1048576}}\n",
-        at_the_sockets_of(&host)
+        datagrams_alone_of(&host)
     ))?;
     let robot = healthy_during("read line")?.replace("--size 320", "--size 32000");
     let script = format!("echo began; {robot}");
@@ -456,7 +458,7 @@ fn the_action_runs_rp_ci_with_its_inputs_and_keeps_the_status() -> Result<()> {
     let step = &action["runs"]["steps"][0];
     let script = step["run"].as_str().context("no script")?;
     let host = Namespace::isolated()?;
-    let place = Place::new(&at_the_sockets_of(&host))?;
+    let place = Place::new(&datagrams_alone_of(&host))?;
     let input = |name: &str| match name {
         "run" => "source ./env.sh; exit $CODE".to_owned(),
         "rp" => RP.to_owned(),
@@ -591,7 +593,7 @@ fn topics_beyond_a_limit_fail_a_strict_run() -> Result<()> {
     let host = Namespace::isolated()?;
     let place = Place::new(&format!(
         "{}limits: {{topics: 1}}\n",
-        at_the_sockets_of(&host)
+        datagrams_alone_of(&host)
     ))?;
     // A shell in the background has no input.
     let end = place.path("end");
@@ -629,7 +631,7 @@ fn topics_beyond_a_limit_fail_a_strict_run() -> Result<()> {
 #[test]
 fn an_agent_that_is_killed_fails_the_run_but_not_the_command() -> Result<()> {
     let host = Namespace::isolated()?;
-    let place = Place::new(&at_the_sockets_of(&host))?;
+    let place = Place::new(&datagrams_alone_of(&host))?;
     let mut process = place.start(&host, &["--settle", "0"], "echo began; read line; exit 0")?;
     process.wait_for("began", PATIENCE)?;
     harness::run(&format!("kill -KILL {}", agent_of(&host)?))?;

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use std::time::{Duration, SystemTime};
 
 use anyhow::{Context as _, Result, ensure};
-use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE, get};
+use ros2probe_testing::harness::agent::{Agent, PACKETS_ALONE, get};
 use ros2probe_testing::harness::network::Link;
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
 use serde_json::Value;
@@ -65,7 +65,7 @@ fn is_within_bounds(
     let configuration = directory.path().join("ros2probe.yaml");
     std::fs::write(
         &configuration,
-        format!("watch: [/imu, /back]\n{ON_THE_WIRE}"),
+        format!("watch: [/imu, /back]\n{PACKETS_ALONE}"),
     )?;
     let agent = Agent::start(&link.monitor, env!("CARGO_BIN_EXE_rp"), &configuration)?;
 

@@ -13,7 +13,7 @@ use std::sync::{PoisonError, RwLock};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, bail, ensure};
-use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE, Scrape};
+use ros2probe_testing::harness::agent::{Agent, PACKETS_ALONE, Scrape};
 use ros2probe_testing::harness::bpf::wait_metered;
 use ros2probe_testing::harness::capture::{self, Capture};
 use ros2probe_testing::harness::dissection::{Dissection, Samples};
@@ -222,7 +222,7 @@ impl Exchange {
         let link = Link::new()?;
         let directory = tempfile::tempdir()?;
         let configuration = directory.path().join("ros2probe.yaml");
-        std::fs::write(&configuration, format!("watch: [/**]\n{ON_THE_WIRE}"))?;
+        std::fs::write(&configuration, format!("watch: [/**]\n{PACKETS_ALONE}"))?;
         let observers = [
             Observer::start("robot", &link.robot, &configuration)?,
             Observer::start("monitor", &link.monitor, &configuration)?,

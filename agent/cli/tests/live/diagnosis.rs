@@ -5,7 +5,7 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use anyhow::{Result, ensure};
-use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE, Scrape};
+use ros2probe_testing::harness::agent::{Agent, PACKETS_ALONE, Scrape};
 use ros2probe_testing::harness::network::Link;
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
 
@@ -17,7 +17,7 @@ fn a_reliable_subscriber_of_a_best_effort_publisher_is_reported_and_gets_nothing
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let file = directory.path().join("ros2probe.yaml");
-    std::fs::write(&file, format!("watch: [/**]\nlog: warn\n{ON_THE_WIRE}"))?;
+    std::fs::write(&file, format!("watch: [/**]\nlog: warn\n{PACKETS_ALONE}"))?;
     let agent = Agent::start(&link.monitor, Path::new(env!("CARGO_BIN_EXE_rp")), &file)?;
     for (publishes, subscribes) in [
         (Stack::Fast, Stack::Fast),

@@ -8,7 +8,7 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, ensure};
-use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE, Scrape, at_the_sockets_of};
+use ros2probe_testing::harness::agent::{Agent, PACKETS_ALONE, Scrape, datagrams_alone_of};
 use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
 use ros2probe_testing::harness::wait_until;
@@ -261,7 +261,7 @@ fn check_late_agent(stack: Stack) -> Result<()> {
 fn watchers(link: &Link) -> Result<[Watcher<'_>; 2]> {
     Ok([
         Watcher::start(&link.monitor)?,
-        Watcher::start_looking(&link.robot, &at_the_sockets_of(&link.robot))?,
+        Watcher::start_looking(&link.robot, &datagrams_alone_of(&link.robot))?,
     ])
 }
 
@@ -387,7 +387,7 @@ struct Watcher<'a> {
 
 impl<'a> Watcher<'a> {
     fn start(host: &'a Namespace) -> Result<Watcher<'a>> {
-        Self::start_looking(host, ON_THE_WIRE)
+        Self::start_looking(host, PACKETS_ALONE)
     }
 
     fn start_looking(host: &'a Namespace, capture: &str) -> Result<Watcher<'a>> {

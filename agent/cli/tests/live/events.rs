@@ -5,7 +5,7 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use anyhow::{Result, ensure};
-use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE};
+use ros2probe_testing::harness::agent::{Agent, PACKETS_ALONE};
 use ros2probe_testing::harness::loss::Loss;
 use ros2probe_testing::harness::network::Link;
 use ros2probe_testing::harness::peer::robot;
@@ -71,7 +71,7 @@ fn a_receiver_receives_events_of_new_nodes_losses_and_silence() -> Result<()> {
     std::fs::write(
         &configuration,
         format!(
-            "watch: [{{topic: /imu, max_silence_s: 1}}]\n{ON_THE_WIRE}\
+            "watch: [{{topic: /imu, max_silence_s: 1}}]\n{PACKETS_ALONE}\
              otlp: {{endpoint: 'http://{endpoint}', metrics: false}}\n"
         ),
     )?;

@@ -2,7 +2,7 @@
 //! in a frame do not overtake samples, so the last samples count.
 
 use anyhow::{Context as _, Result};
-use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE};
+use ros2probe_testing::harness::agent::{Agent, PACKETS_ALONE};
 use ros2probe_testing::harness::network::Link;
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
 use ros2probe_testing::harness::wait_until;
@@ -12,7 +12,7 @@ fn the_last_samples_before_a_goodbye_are_counted() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir().context("cannot create a directory")?;
     let configuration = directory.path().join("ros2probe.yaml");
-    std::fs::write(&configuration, format!("watch: [/**]\n{ON_THE_WIRE}"))
+    std::fs::write(&configuration, format!("watch: [/**]\n{PACKETS_ALONE}"))
         .context("cannot write a configuration")?;
     let agent = Agent::start(&link.robot, env!("CARGO_BIN_EXE_rp"), &configuration)?;
     let stream = Stream::small(0);

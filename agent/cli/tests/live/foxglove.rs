@@ -8,7 +8,9 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, bail, ensure};
 use ros2probe_capture::netns;
-use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE, Scrape, at_the_sockets_of};
+use ros2probe_testing::harness::agent::{
+    Agent, ON_THE_WIRE, Scrape, at_the_sockets_of, datagrams_alone_of,
+};
 use ros2probe_testing::harness::capture::{self, Capture};
 use ros2probe_testing::harness::dissection::{Content, Dissection};
 use ros2probe_testing::harness::network::{Link, Namespace};
@@ -80,7 +82,7 @@ fn payloads_of_cyclone_dds_reach_a_viewer_unchanged() -> Result<()> {
 
 fn check_payloads(stack: Stack, size: usize) -> Result<()> {
     let link = Link::new()?;
-    let configuration = format!("{}watch: []\n", at_the_sockets_of(&link.robot));
+    let configuration = format!("{}watch: []\n", datagrams_alone_of(&link.robot));
     let scene = Scene::start(&link.robot, &configuration)?;
     let stream = Stream {
         reliable: true,
@@ -189,7 +191,7 @@ fn a_slow_or_killed_viewer_affects_no_other_viewer_and_no_capture() -> Result<()
     let host = Namespace::isolated()?;
     let configuration = format!(
         "{}watch: []\nlimits: {{payload_bytes: 25165824}}\n",
-        at_the_sockets_of(&host)
+        datagrams_alone_of(&host)
     );
     let scene = Scene::start(&host, &configuration)?;
     let stream = Stream {

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, ensure};
 use ros2probe_testing::harness;
-use ros2probe_testing::harness::agent::{Agent, at_the_sockets_of};
+use ros2probe_testing::harness::agent::{Agent, datagrams_alone_of};
 use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
 use ros2probe_testing::harness::{wait_until, wait_within};
@@ -37,7 +37,7 @@ impl<'a> Place<'a> {
         let socket = directory.join("api.sock");
         let settings = format!(
             "{}api: {{socket: {}}}\n",
-            at_the_sockets_of(host),
+            datagrams_alone_of(host),
             socket.display()
         );
         std::fs::write(&configuration, &settings)?;

@@ -15,7 +15,7 @@ use ros2probe_testing::harness::usage::Usage;
 use ros2probe_testing::harness::{run, wait_until};
 use tempfile::TempDir;
 
-const WATCH_ALL: &str = "watch: [/**]\ncapture:\n  source: wire\n";
+const WATCH_ALL: &str = "watch: [/**]\ncapture:\n  source: wire\n  inside: off\n";
 /// Sizes of samples: whole frames, frames near the MTU, few and many IP fragments.
 const SIZES: [usize; 6] = [320, 1300, 1440, 4000, 20_000, 60_000];
 const ROUNDS: usize = 20;

@@ -6,7 +6,7 @@ use std::process::{Command, Stdio};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context as _, Result, ensure};
-use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE};
+use ros2probe_testing::harness::agent::{Agent, PACKETS_ALONE};
 use ros2probe_testing::harness::event_log::EventLog;
 use ros2probe_testing::harness::network::Link;
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream, robot};
@@ -22,7 +22,7 @@ fn prometheus_returns_the_rates_at_which_the_demo_robot_publishes() -> Result<()
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let configuration = directory.path().join("ros2probe.yaml");
-    std::fs::write(&configuration, format!("watch: [/**]\n{ON_THE_WIRE}"))?;
+    std::fs::write(&configuration, format!("watch: [/**]\n{PACKETS_ALONE}"))?;
     let agent = Agent::start(&link.robot, env!("CARGO_BIN_EXE_rp"), &configuration)?;
     let prometheus = Prometheus::start(&link.robot, &["127.0.0.1:17400".to_owned()], &[])?;
     let mut roles = Vec::new();

@@ -8,7 +8,7 @@ use std::process::Stdio;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context as _, Result, ensure};
-use ros2probe_testing::harness::agent::{Agent, Scrape, at_the_sockets_of, get};
+use ros2probe_testing::harness::agent::{Agent, Scrape, datagrams_alone_of, get};
 use ros2probe_testing::harness::loss::Loss;
 use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::process::Process;
@@ -295,7 +295,7 @@ fn samples_survive(engine: Kind, text: &str) -> Result<()> {
             "{}state_directory: {}\n\
              remote_write: {{url: 'http://{}:9090/api/v1/write', interval_s: 1, timeout_s: 2, \
              instance: robot7, labels: {{site: hall 2}}}}\n",
-            at_the_sockets_of(&link.robot),
+            datagrams_alone_of(&link.robot),
             state.display(),
             link.monitor.address()
         ),

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use anyhow::{Result, ensure};
 use ros2probe_api::logs::Logs;
-use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE, get};
+use ros2probe_testing::harness::agent::{Agent, PACKETS_ALONE, get};
 use ros2probe_testing::harness::network::Link;
 use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::wait_until;
@@ -36,7 +36,7 @@ fn logs_are_counted_kept_printed_and_diagnosed_without_a_watch() -> Result<()> {
     let link = Link::new()?;
     let config = tempfile::tempdir()?;
     let file = config.path().join("ros2probe.yaml");
-    std::fs::write(&file, format!("watch: []\n{ON_THE_WIRE}"))?;
+    std::fs::write(&file, format!("watch: []\n{PACKETS_ALONE}"))?;
     let rp = env!("CARGO_BIN_EXE_rp");
     let agent = Agent::start(&link.monitor, rp, &file)?;
     let mut node = start(&link)?;
@@ -126,7 +126,7 @@ fn logs_are_not_read_if_the_configuration_disables_them() -> Result<()> {
     let link = Link::new()?;
     let config = tempfile::tempdir()?;
     let file = config.path().join("ros2probe.yaml");
-    let text = format!("watch: [/rosout]\nrobot: {{logs: off}}\n{ON_THE_WIRE}");
+    let text = format!("watch: [/rosout]\nrobot: {{logs: off}}\n{PACKETS_ALONE}");
     std::fs::write(&file, text)?;
     let agent = Agent::start(&link.monitor, env!("CARGO_BIN_EXE_rp"), &file)?;
     let mut node = start(&link)?;

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use anyhow::Result;
 use ros2probe_testing::forged::{Carrier as _, Renewal, SAMPLES_WRITER, Sender, Talker};
-use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE, Scrape, get};
+use ros2probe_testing::harness::agent::{Agent, PACKETS_ALONE, Scrape, get};
 use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::wait_until;
@@ -79,7 +79,7 @@ pub(crate) fn agent<'a>(
     more: &str,
 ) -> Result<Agent<'a>> {
     let file = config.path().join("ros2probe.yaml");
-    std::fs::write(&file, format!("watch: []\n{more}{ON_THE_WIRE}"))?;
+    std::fs::write(&file, format!("watch: []\n{more}{PACKETS_ALONE}"))?;
     Agent::start(&link.monitor, RP, &file)
 }
 

@@ -11,7 +11,7 @@ use crate::browser::player::watch;
 use anyhow::{Context as _, Result, bail, ensure};
 use ros2probe_capture::netns;
 use ros2probe_testing::forged::{Carrier, Talker, framed, introduce, send_sizes};
-use ros2probe_testing::harness::agent::{Agent, Scrape, at_the_sockets_of};
+use ros2probe_testing::harness::agent::{Agent, Scrape, datagrams_alone_of};
 use ros2probe_testing::harness::loss::Loss;
 use ros2probe_testing::harness::network::{INTERFACE, Link, Namespace};
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
@@ -111,7 +111,7 @@ fn check_no_drops(page: &Scrape) -> Result<()> {
 fn counts_and_deliveries_on_one_host_equal_the_logs() -> Result<()> {
     for stream in streams(Ipv4Addr::LOCALHOST) {
         let host = Namespace::isolated()?;
-        let observer = Observer::start(&host, &at_the_sockets_of(&host))?;
+        let observer = Observer::start(&host, &datagrams_alone_of(&host))?;
         let (mut publisher, mut subscriber) = pair(&host, &host, &stream)?;
         let agent = &observer.agent;
         let page = agent.scrape_until("both endpoints", |page| knows(page, &stream.topic))?;
@@ -138,8 +138,8 @@ fn counts_and_deliveries_on_one_host_equal_the_logs() -> Result<()> {
 fn counts_on_two_hosts_equal_the_logs_at_either_end() -> Result<()> {
     let link = Link::new()?;
     for stream in streams(link.robot.address()) {
-        let robot = Observer::start(&link.robot, &at_the_sockets_of(&link.robot))?;
-        let monitor = Observer::start(&link.monitor, &at_the_sockets_of(&link.monitor))?;
+        let robot = Observer::start(&link.robot, &datagrams_alone_of(&link.robot))?;
+        let monitor = Observer::start(&link.monitor, &datagrams_alone_of(&link.monitor))?;
         let (mut publisher, mut subscriber) = pair(&link.robot, &link.monitor, &stream)?;
         for observer in [&robot, &monitor] {
             let agent = &observer.agent;
@@ -185,7 +185,7 @@ fn segments_retransmitted_by_tcp_lose_no_message() -> Result<()> {
             ..small.clone()
         };
         for stream in [small, medium, large] {
-            let monitor = Observer::start(&link.monitor, &at_the_sockets_of(&link.monitor))?;
+            let monitor = Observer::start(&link.monitor, &datagrams_alone_of(&link.monitor))?;
             let (mut publisher, mut subscriber) = pair(&link.robot, &link.monitor, &stream)?;
             let agent = &monitor.agent;
             agent.scrape_until("both endpoints", |page| knows(page, &stream.topic))?;
@@ -226,7 +226,7 @@ fn samples_that_the_sender_drops_are_lost_at_the_sender() -> Result<()> {
         linger: 300.0,
         ..cloud
     };
-    let monitor = Observer::start(&link.monitor, &at_the_sockets_of(&link.monitor))?;
+    let monitor = Observer::start(&link.monitor, &datagrams_alone_of(&link.monitor))?;
     let (mut publisher, subscriber) = pair(&link.robot, &link.monitor, &stream)?;
     let agent = &monitor.agent;
     agent.scrape_until("both endpoints", |page| knows(page, &stream.topic))?;
@@ -264,7 +264,7 @@ fn retransmitted_segments_of_a_link_equal_those_of_the_kernel_and_are_a_finding(
         linger: 300.0,
         ..small
     };
-    let robot = Observer::start(&link.robot, &at_the_sockets_of(&link.robot))?;
+    let robot = Observer::start(&link.robot, &datagrams_alone_of(&link.robot))?;
     let (mut publisher, _subscriber) = pair(&link.robot, &link.monitor, &stream)?;
     let (source, destination) = (link.robot.address(), link.monitor.address());
     let labels = [
@@ -380,7 +380,7 @@ fn a_connection_with_tls_to_an_announced_port_is_counted_and_a_plain_one_is_not(
     let directory = tempfile::tempdir()?;
     let socket = directory.path().join("api.sock");
     let api = format!("api: {{socket: {}}}\n", socket.display());
-    let observer = Observer::start(&host, &format!("{api}{}", at_the_sockets_of(&host)))?;
+    let observer = Observer::start(&host, &format!("{api}{}", datagrams_alone_of(&host)))?;
     let agent = &observer.agent;
 
     // A plain connection of RTPS, and one with TLS at a port that no participant announces.
@@ -457,7 +457,7 @@ fn a_thousand_connections_are_read() -> Result<()> {
     const CONNECTIONS: usize = 1000;
     const ROUNDS: usize = 5;
     let host = Namespace::isolated()?;
-    let observer = Observer::start(&host, &at_the_sockets_of(&host))?;
+    let observer = Observer::start(&host, &datagrams_alone_of(&host))?;
     let mut connections = Connections::open(&host, CONNECTIONS)?;
     let mut talker = Talker::new(1, "/crowd");
     introduce(&talker, &mut connections)?;
@@ -488,7 +488,7 @@ fn a_late_agent_discovers_the_topics_when_another_participant_joins() -> Result<
     let socket = tempfile::tempdir()?;
     let socket = socket.path().join("api.sock");
     let api = format!("api: {{socket: {}}}\n", socket.display());
-    let configuration = format!("{api}{}", at_the_sockets_of(&host));
+    let configuration = format!("{api}{}", datagrams_alone_of(&host));
     let observer = Observer::start(&host, &configuration)?;
     let agent = &observer.agent;
     agent.scrape_until("both participants and a writer", |page| {

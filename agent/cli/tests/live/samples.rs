@@ -16,7 +16,9 @@ use ros2probe::client;
 use ros2probe::client::{Lines, Next};
 use ros2probe_api::samples::{Line, Missed, Sample};
 use ros2probe_testing::harness;
-use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE, Scrape, at_the_sockets_of};
+use ros2probe_testing::harness::agent::{
+    Agent, PACKETS_ALONE, Scrape, at_the_sockets_of, datagrams_alone_of,
+};
 use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream, pair};
 use ros2probe_testing::harness::shared_memory::SharedMemory;
@@ -36,33 +38,33 @@ const DATA: usize = 52;
 
 #[test]
 fn payloads_of_fast_dds_equal_those_that_were_sent() -> Result<()> {
-    check_payloads(Stack::Fast, &SIZES, at_the_sockets_of)
+    check_payloads(Stack::Fast, &SIZES, datagrams_alone_of)
 }
 
 #[test]
 fn payloads_of_cyclone_dds_equal_those_that_were_sent() -> Result<()> {
-    check_payloads(Stack::Cyclone, &SIZES, at_the_sockets_of)
+    check_payloads(Stack::Cyclone, &SIZES, datagrams_alone_of)
 }
 
 #[test]
 fn payloads_of_rust_dds_equal_those_that_were_sent() -> Result<()> {
-    check_payloads(Stack::Rust, &SIZES, at_the_sockets_of)
+    check_payloads(Stack::Rust, &SIZES, datagrams_alone_of)
 }
 
 #[test]
 fn payloads_on_the_wire_equal_those_that_were_sent() -> Result<()> {
     // Samples are in IP fragments, and larger ones in frames of 1.4 KB. A busy machine loses parts
     // of more.
-    let on_the_wire = |_: &Namespace| ON_THE_WIRE.to_owned();
+    let on_the_wire = |_: &Namespace| PACKETS_ALONE.to_owned();
     check_payloads(Stack::Fast, &[60_000, 644_000], on_the_wire)?;
     check_payloads(Stack::Cyclone, &[644_000], on_the_wire)
 }
 
 #[test]
 fn the_last_message_of_a_transient_local_publisher_is_delivered_first() -> Result<()> {
-    let on_the_wire = |_: &Namespace| ON_THE_WIRE.to_owned();
-    check_first(Stack::Fast, at_the_sockets_of)?;
-    check_first(Stack::Cyclone, at_the_sockets_of)?;
+    let on_the_wire = |_: &Namespace| PACKETS_ALONE.to_owned();
+    check_first(Stack::Fast, datagrams_alone_of)?;
+    check_first(Stack::Cyclone, datagrams_alone_of)?;
     check_first(Stack::Cyclone, on_the_wire)
 }
 
@@ -123,7 +125,7 @@ fn check_payloads(
         let link = Link::new()?;
         let source = source(&link.robot);
         // Frames that do not fit into a packet ring are not seen.
-        let lossless_metering = source != ON_THE_WIRE;
+        let lossless_metering = source != PACKETS_ALONE;
         let observed = Observed::start(&link.robot, &source)?;
         let stream = Stream {
             reliable: true,
@@ -369,7 +371,7 @@ impl<'a> Observed<'a> {
 fn stopped_and_killed_readers_delay_no_other_reader() -> Result<()> {
     let host = Namespace::isolated()?;
     let limits = "limits: {payload_bytes: 14680064, subscriptions: 12}\n";
-    let observed = Observed::start(&host, &format!("{limits}{}", at_the_sockets_of(&host)))?;
+    let observed = Observed::start(&host, &format!("{limits}{}", datagrams_alone_of(&host)))?;
     let stream = Stream {
         reliable: true,
         linger: 60.0,

@@ -11,7 +11,7 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, bail, ensure};
-use ros2probe_testing::harness::agent::{Agent, Scrape, at_the_sockets_of, get};
+use ros2probe_testing::harness::agent::{Agent, Scrape, datagrams_alone_of, get};
 use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::harness::peer::{self, Peer, Role, Stack, Stream};
 use ros2probe_testing::harness::process::Process;
@@ -213,7 +213,7 @@ impl<'n> Robot<'n> {
         let state = self.directory.path().join("state");
         fs::create_dir_all(&state)?;
         let path = self.directory.path().join("ros2probe.yaml");
-        let sockets = at_the_sockets_of(self.host);
+        let sockets = datagrams_alone_of(self.host);
         let text = format!(
             "watch: [/imu]\nlog: warn\nstate_directory: {}\n{sockets}",
             state.display()

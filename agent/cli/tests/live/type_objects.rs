@@ -4,7 +4,7 @@
 use std::time::Duration;
 
 use anyhow::{Context as _, Result, ensure};
-use ros2probe_testing::harness::agent::{Agent, at_the_sockets_of, get};
+use ros2probe_testing::harness::agent::{Agent, datagrams_alone_of, get};
 use ros2probe_testing::harness::network::Link;
 use ros2probe_testing::harness::peer::python;
 use ros2probe_testing::harness::process::Process;
@@ -28,7 +28,7 @@ fn a_type_without_a_package_is_echoed_after_a_participant_requested_it() -> Resu
         directory.path().join("ros2probe.yaml"),
         directory.path().join("api.sock"),
     );
-    let source = at_the_sockets_of(host);
+    let source = datagrams_alone_of(host);
     let text = format!("{source}api: {{socket: {}}}\n", socket.display());
     std::fs::write(&file, text)?;
     let _agent = Agent::start(host, env!("CARGO_BIN_EXE_rp"), &file)?;

@@ -23,6 +23,10 @@ pub const METRICS: &str = "http://127.0.0.1:17400";
 /// Configuration for tests of packet sockets.
 pub const ON_THE_WIRE: &str = "capture: {source: wire}\n";
 
+/// Like [`ON_THE_WIRE`], for tests of packets alone: without breakpoints in processes, which the
+/// kernel needs time to verify and to attach.
+pub const PACKETS_ALONE: &str = "capture: {source: wire, inside: off}\n";
+
 /// Maximum wait until the metrics show the sent messages, on a busy machine.
 const PATIENCE: Duration = Duration::from_secs(90);
 /// Maximum wait for the kernel to verify the BPF programs on a busy machine.
@@ -51,6 +55,13 @@ pub struct Scrape(pub String);
 pub fn at_the_sockets_of(host: &Namespace) -> String {
     let cgroup = host.cgroup().display();
     format!("capture: {{source: host, cgroup: {cgroup}}}\n")
+}
+
+/// Like [`at_the_sockets_of`], for tests of datagrams alone: without breakpoints in processes, as
+/// [`PACKETS_ALONE`].
+pub fn datagrams_alone_of(host: &Namespace) -> String {
+    let cgroup = host.cgroup().display();
+    format!("capture: {{source: host, cgroup: {cgroup}, shm: {{exact: off}}, inside: off}}\n")
 }
 
 impl<'a> Agent<'a> {

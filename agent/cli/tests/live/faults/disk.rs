@@ -9,7 +9,7 @@ use anyhow::{Context as _, Result, ensure};
 use serde_json::Value;
 
 use super::{Counted, FaultBench};
-use ros2probe_testing::harness::agent::{ON_THE_WIRE, Scrape};
+use ros2probe_testing::harness::agent::{PACKETS_ALONE, Scrape};
 use ros2probe_testing::harness::network::Link;
 use ros2probe_testing::harness::soak::outcome;
 use ros2probe_testing::harness::{run, wait_until};
@@ -120,7 +120,7 @@ fn a_full_read_only_or_removed_disk_loses_only_its_files_and_no_message() -> Res
     fs::create_dir(&place)?;
     let configuration = format!(
         "watch: [/**]\nstate_directory: {0}/state\nrecordings:\n  directory: {0}/bags\n  reserve_percent: 0\n  reserve_bytes: 0\n  \
-         snapshots: [{{name: incident, topics: [/counted_1], seconds: 60}}]\n{ON_THE_WIRE}",
+         snapshots: [{{name: incident, topics: [/counted_1], seconds: 60}}]\n{PACKETS_ALONE}",
         place.display()
     );
     let script =

@@ -9,7 +9,7 @@ use serde_json::Value;
 
 use super::disk::{readable, writes};
 use super::{Counted, FaultBench};
-use ros2probe_testing::harness::agent::ON_THE_WIRE;
+use ros2probe_testing::harness::agent::PACKETS_ALONE;
 use ros2probe_testing::harness::failing_disk::{Failing, FailingDisk};
 use ros2probe_testing::harness::network::Link;
 use ros2probe_testing::harness::soak::outcome;
@@ -124,7 +124,7 @@ fn an_eio_disk_loses_only_its_files_and_no_message() -> Result<()> {
         .try_for_each(|name| fs::create_dir(place.join(name)))?;
     let configuration = format!(
         "watch: [/**]\nstate_directory: {0}/state\nrecordings:\n  directory: {0}/bags\n  reserve_percent: 0\n  \
-         reserve_bytes: 0\n{ON_THE_WIRE}",
+         reserve_bytes: 0\n{PACKETS_ALONE}",
         place.display()
     );
     let scene = FaultBench::start(&link.robot, &directory, &configuration, &[])?;
