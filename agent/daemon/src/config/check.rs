@@ -7,8 +7,8 @@
 use serde_json::Value;
 
 use super::document::{Content, Key, Node, Scalar, item_path, key_path};
-use super::meaning::check_text;
 use super::mistake::Mistakes;
+use super::text::check_text;
 
 /// Common wrong keys and their correct names: former names first, then likely guesses.
 const COMMON_MISTAKES: &[(&str, &str)] = &[

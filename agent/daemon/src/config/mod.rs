@@ -10,6 +10,7 @@ mod meaning;
 mod mistake;
 mod readable_tokens;
 mod shape;
+mod text;
 
 use std::collections::BTreeSet;
 use std::io;
