@@ -11,18 +11,20 @@ mod frames;
 pub mod lifecycle;
 pub mod logs;
 pub mod parameters;
+mod read_numbers;
+mod standard;
 mod text;
 pub mod transforms;
 
 use std::sync::Arc;
 
 use foldhash::HashMap;
-use ros2probe_wire::diagnostics::{self as wire, DiagnosticStatuses};
-use ros2probe_wire::lifecycle::{self as wire_lifecycle, LifecycleState, Transition};
+use ros2probe_wire::diagnostics::DiagnosticStatuses;
+use ros2probe_wire::lifecycle::{LifecycleState, Transition};
 use ros2probe_wire::ros_parameters::{self, ParameterEvent, RepliedValues, RequestedNames};
 use ros2probe_wire::rtps::{RequestHeader, VendorId};
 use ros2probe_wire::transforms as wire_transforms;
-use ros2probe_wire::{DomainId, Guid, SequenceNumber, Timestamp, WireError, log};
+use ros2probe_wire::{DomainId, Guid, SequenceNumber, WireError, log};
 
 use crate::derive::services::Half;
 use crate::derive::services::service::CallId;
@@ -38,14 +40,16 @@ use crate::facts::tables::RobotWriters;
 use crate::graph::discovery::Discovery;
 use crate::measure::allowance::{Allowance, CommonAllowance, WriterAllowance};
 use crate::measure::assembly::Assembly;
-use crate::measure::sequence::MIN_INCARNATION_GAP;
 use diagnostics::Diagnostics;
 use fields::{FieldMessage, Fields};
 use frames::Frames;
 use lifecycle::{Lifecycle, ManagedNode};
 use logs::Logs;
 use parameters::{ExpectedParameter, Parameters};
+use read_numbers::ReadNumbers;
 use transforms::Transforms;
+
+pub use standard::{Part, Parts, Standard};
 
 /// Maximum size of a message that is decoded, in bytes.
 const MESSAGE_BYTES: usize = 64 << 10;
@@ -60,54 +64,6 @@ const BROADCASTER_ALLOWANCE: Allowance = Allowance::new(2 << 20, 512 << 10);
 const COMMON_BROADCASTER_ALLOWANCE: Allowance = Allowance::new(8 << 20, 2 << 20);
 /// A paused writer is captured again once it is allowed this many bytes.
 const RESUME_BYTES: u64 = 256 << 10;
-
-/// Standard topics and services that the agent reads; each can be switched off.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Part {
-    /// Logs of nodes.
-    Logs,
-    /// Diagnostics.
-    Diagnostics,
-    /// Parameters of nodes.
-    Parameters,
-    /// Transforms between frames.
-    Transforms,
-    /// States of managed nodes.
-    Lifecycle,
-    /// Fields of messages that have metrics.
-    Fields,
-    /// Clocks of hosts.
-    Clocks,
-}
-
-/// A set of parts.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Parts(u8);
-
-/// Standard types that the agent reads.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Standard {
-    /// `rcl_interfaces/msg/Log`.
-    Log,
-    /// `diagnostic_msgs/msg/DiagnosticArray`.
-    Diagnostics,
-    /// `rcl_interfaces/msg/ParameterEvent`.
-    ParameterEvent,
-    /// Request of `rcl_interfaces/srv/SetParameters` or of its atomic variant.
-    SetParameters,
-    /// Requests of `rcl_interfaces/srv/GetParameters`.
-    GetParameters,
-    /// Replies of `rcl_interfaces/srv/GetParameters`.
-    ParameterValues,
-    /// `tf2_msgs/msg/TFMessage`.
-    Transforms,
-    /// `lifecycle_msgs/msg/TransitionEvent`.
-    TransitionEvent,
-    /// Reply of `lifecycle_msgs/srv/GetState`.
-    LifecycleState,
-    /// Any type whose fields have metrics.
-    Fields,
-}
 
 /// What is read of a writer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -213,90 +169,6 @@ pub struct Origin<'a> {
     pub is_late: bool,
     /// The node that has the writer.
     pub node: Option<&'a NodeName>,
-}
-
-/// The latest numbers of a writer that were decoded.
-#[derive(Clone, Copy, Debug, Default)]
-struct ReadNumbers {
-    newest: SequenceNumber,
-    /// Source time of the newest.
-    source: Option<Timestamp>,
-    /// Bit `n` stands for the number `newest - n`.
-    bits: u64,
-}
-
-impl Standard {
-    /// Returns the standard type of this name.
-    #[must_use]
-    pub fn of(message_type: &str) -> Option<Self> {
-        match message_type {
-            log::TYPE => Some(Self::Log),
-            wire::TYPE => Some(Self::Diagnostics),
-            ros_parameters::EVENT => Some(Self::ParameterEvent),
-            wire_transforms::TYPE => Some(Self::Transforms),
-            wire_lifecycle::EVENT => Some(Self::TransitionEvent),
-            wire_lifecycle::STATE_REPLY => Some(Self::LifecycleState),
-            "rcl_interfaces/srv/SetParameters_Request"
-            | "rcl_interfaces/srv/SetParametersAtomically_Request" => Some(Self::SetParameters),
-            "rcl_interfaces/srv/GetParameters_Request" => Some(Self::GetParameters),
-            "rcl_interfaces/srv/GetParameters_Response" => Some(Self::ParameterValues),
-            _ => None,
-        }
-    }
-
-    /// Returns its name as a stage of decoding.
-    #[must_use]
-    pub const fn stage(self) -> &'static str {
-        match self {
-            Self::Log => "log",
-            Self::Diagnostics => "diagnostics",
-            Self::ParameterEvent => "parameter_event",
-            Self::SetParameters => "set_parameters",
-            Self::GetParameters => "get_parameters",
-            Self::ParameterValues => "parameter_values",
-            Self::Transforms => "transforms",
-            Self::TransitionEvent => "transition_event",
-            Self::LifecycleState => "lifecycle_state",
-            Self::Fields => "fields",
-        }
-    }
-
-    /// Returns the part that reads it.
-    #[must_use]
-    pub const fn part(self) -> Part {
-        match self {
-            Self::Log => Part::Logs,
-            Self::Diagnostics => Part::Diagnostics,
-            Self::ParameterEvent
-            | Self::SetParameters
-            | Self::GetParameters
-            | Self::ParameterValues => Part::Parameters,
-            Self::Transforms => Part::Transforms,
-            Self::TransitionEvent | Self::LifecycleState => Part::Lifecycle,
-            Self::Fields => Part::Fields,
-        }
-    }
-}
-
-impl Parts {
-    /// All parts, up to the last one.
-    pub const ALL: Self = Self((1 << (Part::Clocks as u8 + 1)) - 1);
-
-    /// Returns whether it contains this part.
-    #[must_use]
-    pub const fn has(self, part: Part) -> bool {
-        self.0 >> part as u8 & 1 != 0
-    }
-}
-
-impl FromIterator<Part> for Parts {
-    fn from_iter<T: IntoIterator<Item = Part>>(parts: T) -> Self {
-        Self(
-            parts
-                .into_iter()
-                .fold(0, |bits, part| bits | 1 << part as u8),
-        )
-    }
 }
 
 impl Allowances {
@@ -732,87 +604,10 @@ impl Origin<'_> {
     }
 }
 
-impl ReadNumbers {
-    /// Returns whether the number was added. Numbers far below the newest count as added, as copies
-    /// that a later subscriber requests.
-    fn has(&self, number: SequenceNumber, source: Option<Timestamp>) -> bool {
-        match self.newest.steps_since(number) {
-            _ if number > self.newest || self.is_restart(number, source) => false,
-            steps => steps >= 64 || self.bits >> steps & 1 != 0,
-        }
-    }
-
-    /// Adds a number. Returns whether a higher one was added before.
-    fn add(&mut self, number: SequenceNumber, source: Option<Timestamp>) -> bool {
-        if self.is_restart(number, source) {
-            *self = Self::default();
-        }
-        match number.steps_since(self.newest) {
-            0 => self.bits |= 1_u64.checked_shl(steps(self.newest, number)).unwrap_or(0),
-            _ => {
-                let moved = steps(number, self.newest);
-                self.bits = self.bits.checked_shl(moved).unwrap_or(0) | 1;
-                (self.newest, self.source) = (number, source);
-            }
-        }
-        number < self.newest
-    }
-
-    /// Returns whether the writer has restarted its numbers: a lower one was written later.
-    fn is_restart(&self, number: SequenceNumber, source: Option<Timestamp>) -> bool {
-        let times = source.zip(self.source);
-        number < self.newest
-            && times.is_some_and(|(new, newest)| new > newest + MIN_INCARNATION_GAP)
-    }
-}
-
 /// Returns the length of the header that this implementation sends before requests and replies.
 const fn header(vendor: VendorId) -> usize {
     match vendor {
         VendorId::CYCLONE => RequestHeader::LENGTH,
         _ => 0,
-    }
-}
-
-/// Returns the steps from `lower` to `number`, as far as 32 bits hold them.
-fn steps(number: SequenceNumber, lower: SequenceNumber) -> u32 {
-    u32::try_from(number.steps_since(lower)).unwrap_or(u32::MAX)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    const LATER: Timestamp = Timestamp(MIN_INCARNATION_GAP.as_nanos() as u64 + 2);
-
-    #[test]
-    fn a_sequence_number_is_new_once_and_numbers_below_the_window_are_copies() {
-        let mut read = ReadNumbers::default();
-        let mut is_new = |number| {
-            let number = SequenceNumber(number);
-            let is_new = !read.has(number, None);
-            if is_new {
-                let is_late = number < read.newest;
-                assert_eq!(read.add(number, None), is_late);
-            }
-            is_new
-        };
-        assert!(is_new(100) && !is_new(100));
-        assert!(is_new(102) && is_new(101) && !is_new(101) && !is_new(102));
-        assert!(is_new(40) && !is_new(40), "within the window");
-        assert!(!is_new(38), "before it");
-        assert!(is_new(1 << 40) && !is_new(102) && is_new((1 << 40) - 63));
-    }
-
-    #[test]
-    fn a_lower_number_with_a_later_source_time_is_that_of_a_restarted_writer() {
-        let mut read = ReadNumbers::default();
-        let [first, later] = [Some(Timestamp(1)), Some(LATER)];
-        assert!(!read.add(SequenceNumber(1 << 40), first));
-        assert!(read.has(SequenceNumber(7), first), "a copy");
-        assert!(!read.has(SequenceNumber(7), later));
-        assert!(!read.add(SequenceNumber(7), later), "not late");
-        assert!(read.has(SequenceNumber(7), later));
-        assert!(!read.has(SequenceNumber(8), later));
     }
 }
