@@ -1,5 +1,5 @@
-//! Requests of OTLP that are too large for a receiver or for a slow link arrive in parts. A replay
-//! has no queue on disk.
+//! Requests of OTLP that are too large for a receiver or for a slow link arrive in parts, and those
+//! with an expired token arrive after its replacement. A replay has no queue on disk.
 
 use std::collections::VecDeque;
 use std::convert::Infallible;
@@ -337,5 +337,116 @@ async fn a_slow_link_loses_nothing_over_grpc() {
     assert_eq!(without_repeated(received.numbers()), expected);
     for reason in ["too_large", "refused", "overflow"] {
         agent.wait_for_metric(&dropped(reason), |count| count < 0.5);
+    }
+}
+
+/// A receiver that accepts only requests with this value of `authorization`.
+#[derive(Clone)]
+struct Guarded(Received);
+
+const ACCEPTED: &str = "Bearer second";
+
+#[tonic::async_trait]
+impl LogsService for Guarded {
+    async fn export(
+        &self,
+        request: tonic::Request<ExportLogsServiceRequest>,
+    ) -> Result<tonic::Response<ExportLogsServiceResponse>, tonic::Status> {
+        let token = request.metadata().get("authorization");
+        if token.and_then(|token| token.to_str().ok()) != Some(ACCEPTED) {
+            return Err(tonic::Status::unauthenticated("unknown token"));
+        }
+        self.0.export(request).await
+    }
+}
+
+async fn guarded_grpc() -> (SocketAddr, Received) {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let address = listener.local_addr().unwrap();
+    let received = Received::default();
+    let service = LogsServiceServer::new(Guarded(received.clone()));
+    let server = tonic::transport::Server::builder().add_service(service);
+    let incoming = tonic::transport::server::TcpIncoming::from(listener);
+    tokio::spawn(server.serve_with_incoming(incoming));
+    (address, received)
+}
+
+/// Starts a receiver over HTTP. It answers requests with another token with this status.
+async fn guarded_http(status: u16) -> (SocketAddr, Received) {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let address = listener.local_addr().unwrap();
+    let received = Received::default();
+    let taken = received.clone();
+    tokio::spawn(async move {
+        loop {
+            let (stream, _) = listener.accept().await.unwrap();
+            let received = taken.clone();
+            let answer = service_fn(move |request: hyper::Request<Incoming>| {
+                let received = received.clone();
+                async move {
+                    let token = request.headers().get("authorization");
+                    let is_known =
+                        token.is_some_and(|token| token.as_bytes() == ACCEPTED.as_bytes());
+                    let answer = match is_known {
+                        true => http_answer(request, usize::MAX, &received).await,
+                        false => {
+                            let mut refused = hyper::Response::default();
+                            *refused.status_mut() = hyper::StatusCode::from_u16(status).unwrap();
+                            refused
+                        }
+                    };
+                    Ok::<_, Infallible>(answer)
+                }
+            });
+            let server = hyper::server::conn::http1::Builder::new();
+            tokio::spawn(server.serve_connection(TokioIo::new(stream), answer));
+        }
+    });
+    (address, received)
+}
+
+/// Earlier, the agent read the token only at its start, and a refusal of it cost the items.
+fn all_arrive_after_a_replacement(address: SocketAddr, options: &str, received: &Received) {
+    let directory = tempfile::tempdir().unwrap();
+    let pcap = directory.path().join("robot.pcap");
+    capture(&pcap, MESSAGES);
+    let file = directory.path().join("headers");
+    std::fs::write(&file, "authorization: Bearer first\n").unwrap();
+    let options = format!("{options}headers_file: {}", file.display());
+    let mut agent = agent(directory.path(), address, &options, &pcap);
+    agent.wait_for_log("the OTLP receiver refuses the export");
+    std::fs::write(&file, "no header\n").unwrap();
+    agent.wait_for_log("a replaced file of OTLP headers cannot be used");
+    assert_eq!(received.numbers().len(), 0);
+    std::fs::write(&file, format!("authorization: {ACCEPTED}\n")).unwrap();
+    received.wait(MESSAGES);
+    let expected: Vec<_> = (0..MESSAGES).collect();
+    assert_eq!(without_repeated(received.numbers()), expected);
+    for reason in ["too_large", "refused", "overflow"] {
+        agent.wait_for_metric(&dropped(reason), |count| count < 0.5);
+    }
+    let log = agent.log();
+    assert_eq!(log.matches("cannot be used").count(), 1, "{log}");
+    assert!(!log.contains("Bearer"), "{log}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+async fn an_expired_token_loses_nothing_and_its_successor_needs_no_restart_over_grpc() {
+    let (address, received) = guarded_grpc().await;
+    all_arrive_after_a_replacement(address, "", &received);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+async fn an_expired_token_loses_nothing_and_its_successor_needs_no_restart_over_http() {
+    let (address, received) = guarded_http(401).await;
+    all_arrive_after_a_replacement(address, "protocol: http/protobuf, ", &received);
+}
+
+/// The portal of a network redirects requests, and a receiver that fails answers 500.
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+async fn a_redirection_and_a_failure_of_the_receiver_lose_nothing() {
+    for status in [302, 500] {
+        let (address, received) = guarded_http(status).await;
+        all_arrive_after_a_replacement(address, "protocol: http/protobuf, ", &received);
     }
 }

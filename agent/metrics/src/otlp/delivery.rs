@@ -13,6 +13,7 @@ use opentelemetry_sdk::error::{OTelSdkError, OTelSdkResult};
 use tokio::time::{Instant, sleep, timeout_at};
 use tokio_util::sync::CancellationToken;
 
+use super::encoded_sender::is_temporary;
 use super::exports::{Exports, Outcome, Reason, Signal};
 use super::kept::{Kept, KeptRequest};
 use super::reports::{Failure, Report, unreported_failure};
@@ -253,7 +254,9 @@ impl<E: Export> Delivery<E> {
                     other => other.to_string(),
                 };
                 let failure = match report.failure() {
-                    Failure::Refused if is_of_connection(&error) => Failure::Temporary,
+                    Failure::Refused if is_of_connection(&error) || is_of_receiver(&error) => {
+                        Failure::Temporary
+                    }
                     failure => failure,
                 };
                 Err((error, failure))
@@ -376,6 +379,15 @@ fn is_of_connection(error: &str) -> bool {
     after.is_some_and(|(_, after)| after.contains(": "))
 }
 
+/// Returns whether a refusal that the library does not repeat concerns the credentials, the address
+/// or the state of the receiver.
+fn is_of_receiver(error: &str) -> bool {
+    let after = |text: &str| Some(error.split_once(text)?.1);
+    let status = after("status code: ").and_then(|status| status.parse().ok());
+    let code = after("gRPC code: ").unwrap_or_default();
+    ["Unauthenticated", "PermissionDenied"].contains(&code) || status.is_some_and(is_temporary)
+}
+
 /// Returns whether the receiver, or a proxy before it, may have refused a request of the library for
 /// its size. The library does not return the status of HTTP that a proxy answers a gRPC request with.
 fn may_be_too_large(error: &str) -> bool {
@@ -384,4 +396,31 @@ fn may_be_too_large(error: &str) -> bool {
         .iter()
         .any(|part| error.contains(part));
     is_of_proxy || is_of_receiver
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_refusal_of_all_requests_is_no_refusal_of_the_items() {
+        for error in [
+            "TonicLogsClient export failed with gRPC code: Unauthenticated",
+            "TonicLogsClient export failed with gRPC code: PermissionDenied",
+            "HTTP export failed with status code: 302",
+            "HTTP export failed with status code: 401",
+            "HTTP export failed with status code: 404",
+            "HTTP export failed with status code: 500",
+        ] {
+            assert!(is_of_receiver(error), "{error}");
+        }
+        for error in [
+            "TonicLogsClient export failed with gRPC code: InvalidArgument",
+            "HTTP export failed with status code: 400",
+            "HTTP export failed with status code: 413",
+            "export timed out",
+        ] {
+            assert!(!is_of_receiver(error), "{error}");
+        }
+    }
 }

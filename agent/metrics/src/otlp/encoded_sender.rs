@@ -32,8 +32,9 @@ use tonic::metadata::MetadataMap;
 use tonic::transport::Channel;
 use tonic::{Code, Status, TimeoutExpired};
 
+use super::headers::Headers;
 use super::reports::{self, Failure};
-use super::transport::SentHeaders;
+use super::transport::{SentHeaders, overwrite};
 
 /// A service of OTLP, as the type of its requests.
 pub(super) trait Service: Message + Default + Clone {
@@ -181,14 +182,25 @@ pub(super) struct EncodedSender {
 }
 
 enum Protocol {
-    Grpc { channel: Channel, gzip: bool },
+    Grpc {
+        channel: Channel,
+        gzip: bool,
+        /// Headers of the configuration, which may be newer than those of the last request. A client
+        /// of HTTP adds them itself.
+        own: Headers,
+    },
     Http(Arc<dyn HttpClient>, Uri),
 }
 
 impl EncodedSender {
-    pub(super) const fn grpc(channel: Channel, gzip: bool, headers: SentHeaders) -> Self {
+    pub(super) const fn grpc(
+        channel: Channel,
+        gzip: bool,
+        headers: SentHeaders,
+        own: Headers,
+    ) -> Self {
         Self {
-            protocol: Protocol::Grpc { channel, gzip },
+            protocol: Protocol::Grpc { channel, gzip, own },
             headers,
         }
     }
@@ -241,15 +253,16 @@ impl EncodedSender {
     /// Sends a request once. The delivery offers a failed request again. The exporter must have
     /// sent a request before, because only the library reads headers from the environment.
     pub(super) async fn send<S: Service>(&self, request: &S) -> OTelSdkResult {
-        let headers = self
+        let mut headers = self
             .headers
             .lock()
             .unwrap_or_else(PoisonError::into_inner)
             .clone()
             .unwrap_or_default();
         let response = match &self.protocol {
-            Protocol::Grpc { channel, gzip } => {
+            Protocol::Grpc { channel, gzip, own } => {
                 reports::attempt();
+                overwrite(&mut headers, &own.current());
                 let mut request = tonic::Request::new(request.clone());
                 *request.metadata_mut() = MetadataMap::from_headers(headers);
                 match S::call(channel.clone(), *gzip, request).await {
@@ -288,8 +301,8 @@ impl EncodedSender {
                 };
                 if !response.status().is_success() {
                     match response.status().as_u16() {
-                        429 | 502 | 503 | 504 => {}
                         413 => reports::failed(Failure::TooLarge),
+                        status if is_temporary(status) => {}
                         _ => reports::failed(Failure::Refused),
                     }
                     return failure(format!("export failed with status {}", response.status()));
@@ -310,7 +323,15 @@ fn failure(reason: String) -> OTelSdkResult {
     Err(OTelSdkError::InternalFailure(reason))
 }
 
+/// Returns whether a status of HTTP concerns the credentials, the address or the state of the
+/// receiver, and not the items: all others would get it, too. OTLP 1.x lets a client repeat only 429
+/// and 502 to 504, but then an expired token or the portal of a network would cost all items.
+pub(super) const fn is_temporary(status: u16) -> bool {
+    matches!(status, 300..=399 | 401 | 403 | 404 | 407 | 408 | 429 | 500..=599)
+}
+
 /// Returns why a request failed, and with it whether it may be repeated (OTLP 1.x, "Failures").
+/// Credentials are replaced some day, and the items wait for it.
 fn failure_of(status: &Status) -> Failure {
     match status.code() {
         Code::ResourceExhausted | Code::OutOfRange if is_of_size(status.message()) => {
@@ -324,7 +345,9 @@ fn failure_of(status: &Status) -> Failure {
         | Code::Aborted
         | Code::OutOfRange
         | Code::Unavailable
-        | Code::DataLoss => Failure::Temporary,
+        | Code::DataLoss
+        | Code::Unauthenticated
+        | Code::PermissionDenied => Failure::Temporary,
         // Details mean that the receiver is busy, and when to try again.
         Code::ResourceExhausted if !status.details().is_empty() => Failure::Temporary,
         _ => Failure::Refused,
@@ -369,6 +392,8 @@ mod tests {
             (Code::Cancelled, "", Failure::Temporary),
             (Code::DeadlineExceeded, "", Failure::Temporary),
             (Code::InvalidArgument, "length too large", Failure::Refused),
+            (Code::Unauthenticated, "", Failure::Temporary),
+            (Code::PermissionDenied, "", Failure::Temporary),
         ] {
             assert_eq!(failure(code, message), expected, "{code:?} {message}");
         }

@@ -11,6 +11,7 @@ mod endpoint;
 mod events;
 mod exporter;
 mod exports;
+mod headers;
 mod instruments;
 mod kept;
 mod metrics;

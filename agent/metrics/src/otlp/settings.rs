@@ -1,5 +1,5 @@
 //! Export settings: the file's `otlp` section, then the standard `OTEL_*` variables, then defaults.
-//! They are read once at startup.
+//! They are read once at startup, but for the file with headers.
 //!
 //! `opentelemetry-otlp` reads the variables of headers itself. However, it exports a signal even
 //! without an endpoint, and accepts no settings for the connection of `transport.rs`.
@@ -14,11 +14,12 @@ use opentelemetry_sdk::Resource;
 use ros2probe_wire::log::LogLevel;
 use schemars::JsonSchema;
 use serde::Deserialize;
-use tonic::codegen::http::{HeaderMap, HeaderName, HeaderValue, Uri};
+use tonic::codegen::http::Uri;
 use tracing_subscriber::filter::LevelFilter;
 
 use super::endpoint::otlp_endpoint;
 use super::exports::Signal;
+use super::headers::Headers;
 use super::resource::{Host, resource};
 
 /// Default interval of metric exports, and default timeout of a request.
@@ -27,8 +28,6 @@ const DEFAULT_TIMEOUT: Duration = Duration::from_secs(10);
 /// Default and least size of each queue on disk, in bytes.
 const DEFAULT_QUEUE: u64 = 32 << 20;
 const MIN_QUEUE: u64 = 1 << 20;
-/// Maximum size of a file with headers, in bytes.
-const HEADERS_BYTES: u64 = 1 << 20;
 
 /// Reads a text of at most this many bytes.
 pub type ReadText = fn(&Path, u64) -> io::Result<String>;
@@ -110,7 +109,7 @@ pub(super) struct Target {
     pub(super) is_grpc: bool,
     pub(super) endpoint: Uri,
     /// Headers of the configuration.
-    pub(super) headers: HeaderMap,
+    pub(super) headers: Headers,
     pub(super) timeout: Duration,
     pub(super) gzip: bool,
 }
@@ -329,7 +328,7 @@ fn target(
     Ok(Some(Target {
         is_grpc,
         endpoint,
-        headers: headers(file, read)?,
+        headers: Headers::resolve(file, read)?,
         timeout: timeout.unwrap_or(DEFAULT_TIMEOUT),
         gzip,
     }))
@@ -347,41 +346,6 @@ const fn path(signal: Signal) -> &'static str {
 fn http_endpoint(text: &str, path: &str) -> Option<Uri> {
     otlp_endpoint(text)?;
     format!("{}{path}", text.trim_end_matches('/')).parse().ok()
-}
-
-/// Returns the headers of the configuration and of its file with headers.
-fn headers(file: &OtlpSettings, read: ReadText) -> Result<HeaderMap, SettingsError> {
-    let mut headers = HeaderMap::new();
-    let mut add = |place: &str, name: &str, value: &str| {
-        let pair = HeaderName::from_bytes(name.trim().as_bytes())
-            .ok()
-            .zip(HeaderValue::from_str(value.trim()).ok());
-        let (key, mut value) = pair.ok_or_else(|| SettingsError::Header {
-            place: place.to_owned(),
-            name: name.to_owned(),
-        })?;
-        value.set_sensitive(true);
-        headers.insert(key, value);
-        Ok::<(), SettingsError>(())
-    };
-    for (name, value) in &file.headers {
-        add("otlp.headers", name, value)?;
-    }
-    if let Some(path) = &file.headers_file {
-        let text = read(path, HEADERS_BYTES).map_err(|source| SettingsError::HeadersFile {
-            path: path.clone(),
-            source,
-        })?;
-        let place = path.display().to_string();
-        for line in text.lines().map(str::trim) {
-            if line.is_empty() || line.starts_with('#') {
-                continue;
-            }
-            let (name, value) = line.split_once(':').unwrap_or((line, ""));
-            add(&place, name, value)?;
-        }
-    }
-    Ok(headers)
 }
 
 #[cfg(test)]
@@ -514,7 +478,7 @@ mod tests {
         let settings = resolve(&file, &environment).unwrap().unwrap();
         assert_eq!(endpoint_of(&settings.metrics), "http://127.0.0.1:4317/");
         let metrics = settings.metrics.unwrap();
-        assert!(!metrics.gzip && metrics.headers.len() == 1);
+        assert!(!metrics.gzip && metrics.headers.current().len() == 1);
         assert_eq!(
             (metrics.timeout.as_secs(), settings.interval.as_secs()),
             (3, 30)
@@ -562,7 +526,7 @@ mod tests {
             ..at("http://a")
         };
         let settings = resolve(&settings, &[]).unwrap().unwrap();
-        let headers = settings.events.unwrap().headers;
+        let headers = settings.events.unwrap().headers.current();
         assert_eq!(headers.get("authorization").unwrap(), "Bearer a:b=");
         assert!(!format!("{headers:?}").contains("Bearer"), "not in a log");
     }

@@ -20,6 +20,7 @@ use tonic::metadata::MetadataMap;
 use tonic::transport::{Channel, ClientTlsConfig, Endpoint};
 
 use super::encoded_sender::EncodedSender;
+use super::headers::Headers;
 use super::reports;
 use super::settings::{SettingsError, Target};
 use crate::connector::{connect_timeout, connector};
@@ -81,7 +82,8 @@ impl Transport {
         let headers = Arc::clone(&self.sent);
         match &self.connection {
             Connection::Grpc(channel) => {
-                EncodedSender::grpc(channel.clone(), self.target.gzip, headers)
+                let own = self.target.headers.clone();
+                EncodedSender::grpc(channel.clone(), self.target.gzip, headers, own)
             }
             Connection::Http(client) => {
                 EncodedSender::http(Arc::clone(client), self.target.endpoint.clone(), headers)
@@ -112,7 +114,7 @@ impl Transport {
         let interceptor = move |mut request: tonic::Request<()>| {
             reports::attempt();
             let mut headers = std::mem::take(request.metadata_mut()).into_headers();
-            overwrite(&mut headers, &own);
+            overwrite(&mut headers, &own.current());
             *sent.lock().unwrap_or_else(PoisonError::into_inner) = Some(headers.clone());
             *request.metadata_mut() = MetadataMap::from_headers(headers);
             Ok(request)
@@ -194,7 +196,7 @@ fn http_client(target: &Target, sent: &SentHeaders) -> Result<Arc<dyn HttpClient
 #[derive(Debug)]
 struct Client<C> {
     client: C,
-    headers: HeaderMap,
+    headers: Headers,
     sent: SentHeaders,
 }
 
@@ -202,14 +204,14 @@ struct Client<C> {
 impl<C: HttpClient> HttpClient for Client<C> {
     async fn send_bytes(&self, mut request: Request<Bytes>) -> Result<Response<Bytes>, HttpError> {
         reports::attempt();
-        overwrite(request.headers_mut(), &self.headers);
+        overwrite(request.headers_mut(), &self.headers.current());
         *self.sent.lock().unwrap_or_else(PoisonError::into_inner) = Some(request.headers().clone());
         self.client.send_bytes(request).await
     }
 }
 
 /// Sets the headers of the configuration, which take precedence over those of the environment.
-fn overwrite(headers: &mut HeaderMap, own: &HeaderMap) {
+pub(super) fn overwrite(headers: &mut HeaderMap, own: &HeaderMap) {
     for (name, value) in own {
         headers.insert(name.clone(), value.clone());
     }
