@@ -7,6 +7,12 @@ use ros2probe_api::fleet::{Comparison, Difference, Fleet, PRESENT, Robot, State}
 use super::differences::{self, MIN_ROBOTS, Trait};
 use super::engine::{Engine, EngineError, Labels};
 
+/// Minimum numbers of decimal and of hexadecimal digits that are no part of a common name.
+const MIN_DECIMAL: usize = 3;
+const MIN_HEXADECIMAL: usize = 8;
+/// Numbers of hexadecimal digits of a UUID's parts.
+const UUID_DIGITS: [usize; 5] = [8, 4, 4, 4, 12];
+
 /// Which robots, and how far back.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Question {
@@ -250,8 +256,8 @@ fn value(samples: &[(Labels, f64)]) -> Option<f64> {
     samples.first().map(|(_, value)| *value)
 }
 
-/// Returns a name as it is on every robot: the robot's own name in it is `<robot>`, and a number of
-/// three or more digits, as of a process, is `<number>`.
+/// Returns a name as it is on every robot: the robot's own name in it is `<robot>`, and a number that
+/// differs with each process or start is `<number>`.
 fn common(name: &str, robot: &str) -> String {
     let tokens = name.split('/').map(|token| {
         if token == robot || token == robot.replace(['-', '.'], "_") {
@@ -263,12 +269,38 @@ fn common(name: &str, robot: &str) -> String {
     tokens.collect::<Vec<_>>().join("/")
 }
 
+/// Replaces the numbers of a token by `<number>`, of which a UUID with underscores is one.
 fn without_number(token: &str) -> String {
-    let parts = token.split('_').map(|part| {
-        let is_number = part.len() >= 3 && part.bytes().all(|byte| byte.is_ascii_digit());
-        if is_number { "<number>" } else { part }
-    });
-    parts.collect::<Vec<_>>().join("_")
+    let parts: Vec<&str> = token.split('_').collect();
+    let mut left = parts.as_slice();
+    let mut kept = Vec::new();
+    while let Some((&part, rest)) = left.split_first() {
+        let uuid = left.split_at_checked(UUID_DIGITS.len());
+        let uuid = uuid.filter(|(uuid, _)| {
+            let lengths = uuid.iter().map(|part| part.len());
+            lengths.eq(UUID_DIGITS) && uuid.iter().all(|part| is_hexadecimal(part))
+        });
+        let (after, part) = match uuid {
+            Some((_, after)) => (after, "<number>"),
+            None if is_number(part) => (rest, "<number>"),
+            None => (rest, part),
+        };
+        left = after;
+        kept.push(part);
+    }
+    kept.join("_")
+}
+
+/// Returns whether a part of a name is the number of a process, an address in memory or a UUID.
+fn is_number(part: &str) -> bool {
+    let has_digit = part.bytes().any(|byte| byte.is_ascii_digit());
+    let is_decimal = part.bytes().all(|byte| byte.is_ascii_digit());
+    (part.len() >= MIN_DECIMAL && is_decimal)
+        || (part.len() >= MIN_HEXADECIMAL && has_digit && is_hexadecimal(part))
+}
+
+fn is_hexadecimal(part: &str) -> bool {
+    part.bytes().all(|byte| byte.is_ascii_hexdigit())
 }
 
 /// Returns a text as a string of PromQL.
@@ -281,12 +313,26 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_of_a_robot_and_of_a_process_are_the_same_on_every_robot() {
+    fn names_of_a_robot_of_a_process_and_of_a_mission_are_the_same_on_every_robot() {
         let common = |name: &str| super::common(name, "robot-7");
         assert_eq!(common("/robot_7/scan"), "/<robot>/scan");
         assert_eq!(common("/robot-7"), "/<robot>");
         assert_eq!(common("/launch_ros_4711"), "/launch_ros_<number>");
         assert_eq!(common("/camera_2/image"), "/camera_2/image");
+        // The listener of tf2 has an address in its name, and a mission its UUID.
+        let listener = "/transform_listener_impl_5581a5d0b0c0";
+        assert_eq!(common(listener), "/transform_listener_impl_<number>");
+        for uuid in [
+            "6ba7b8109dad11d180b400c04fd430c8",
+            "6ba7b810_9dad_11d1_80b4_00c04fd430c8",
+            "deadbeef_dead_beef_dead_deadbeefdead",
+        ] {
+            let mission = format!("/mission_{uuid}/state");
+            assert_eq!(common(&mission), "/mission_<number>/state");
+        }
+        for name in ["/facade_added", "/beadface", "/gripper_12/a_b_c_d", "/_"] {
+            assert_eq!(common(name), name);
+        }
         assert_eq!(quoted("a\"b\\"), "\"a\\\"b\\\\\"");
     }
 
