@@ -13,9 +13,7 @@ use ros2probe_api::fleet::{Incidents, Robot, RobotWithIncidents, State};
 use ros2probe_capture::error_chain::in_words;
 use ros2probe_daemon::agent::DEFAULT_CONFIG;
 use ros2probe_daemon::config::{Config, FleetSettings};
-use ros2probe_daemon::fleet::{
-    self, Engine, IncidentReader, Link, MAX_BYTES, Sources, TOKEN_BYTES,
-};
+use ros2probe_daemon::fleet::{self, Engine, IncidentReader, Link, MAX_BYTES, Sources};
 use tokio::time::timeout;
 
 use super::{Output, UserError};
@@ -89,13 +87,10 @@ impl Fleet {
                 format!("rp: no engine is named: pass --engine URL, or set {ENGINE_VARIABLE}");
             return Err(UserError(text).into());
         };
-        let token = settings.token_file.map(|path| {
-            let text = ros2probe_daemon::file::read_text(&path, TOKEN_BYTES);
-            text.with_context(|| format!("cannot read {}", path.display()))
-        });
+        let token_file = settings.token_file.as_deref();
         let incidents = settings.store.map(IncidentReader::new).transpose();
         let sources = Sources {
-            engine: Engine::new(&url, token.transpose()?.as_deref(), MAX_BYTES)?,
+            engine: Engine::new(&url, token_file, MAX_BYTES)?,
             question: settings.question,
             incidents: incidents.context("fleet.store")?,
         };

@@ -18,6 +18,13 @@ const PATIENCE: Duration = Duration::from_secs(60);
 fn engine(
     answer: impl Fn(&mut dyn std::io::Write) -> std::io::Result<()> + Send + 'static,
 ) -> SocketAddr {
+    engine_that_reads(move |_, out| answer(out))
+}
+
+/// The same, with an answer to the begin of the request.
+fn engine_that_reads(
+    answer: impl Fn(&str, &mut dyn std::io::Write) -> std::io::Result<()> + Send + 'static,
+) -> SocketAddr {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let address = listener.local_addr().unwrap();
     std::thread::spawn(move || {
@@ -27,9 +34,10 @@ fn engine(
                 .set_read_timeout(Some(Duration::from_secs(5)))
                 .unwrap();
             let mut request = [0; 4096];
-            let _ = stream.read(&mut request);
+            let length = stream.read(&mut request).unwrap_or(0);
+            let request = String::from_utf8_lossy(&request[..length]);
             // `rp` may have closed the connection.
-            let _ = answer(&mut stream);
+            let _ = answer(&request, &mut stream);
         }
     });
     address
@@ -442,5 +450,48 @@ fn a_token_of_the_engine_that_cannot_be_read_ends_the_start() {
     let output = command.arg(local_agent::capture()).output().unwrap();
     let text = String::from_utf8(output.stderr).unwrap();
     assert!(!output.status.success(), "{text}");
-    assert!(text.contains("cannot read `fleet.token_file`"), "{text}");
+    assert!(text.contains("cannot use `fleet.token_file`"), "{text}");
+    assert!(
+        text.contains(&format!("cannot read {}", token.display())),
+        "{text}"
+    );
+}
+
+#[test]
+fn a_replaced_token_of_the_engine_needs_no_restart() {
+    let guarded = engine_that_reads(|request, out| {
+        let (status, text) = match request.contains("authorization: Bearer second\r\n") {
+            true => (
+                "200 OK",
+                r#"{"status":"success","data":{"resultType":"vector","result":[]}}"#,
+            ),
+            false => ("401 Unauthorized", "unknown token"),
+        };
+        let length = text.len();
+        write!(
+            out,
+            "HTTP/1.1 {status}\r\nContent-Length: {length}\r\n\r\n{text}"
+        )
+    });
+    let directory = tempfile::tempdir().unwrap();
+    let token = directory.path().join("token");
+    std::fs::write(&token, "first\n").unwrap();
+    let yaml = format!(
+        "fleet: {{engine: 'http://{guarded}', token_file: {}}}\n",
+        token.display()
+    );
+    let agent = agent(directory.path(), &yaml);
+    let problem_with = |part: &str| {
+        let answer = fleet_of(&agent, |answer| {
+            let problem = answer["problem"].as_str();
+            problem.is_some_and(|problem| problem.contains(part))
+        });
+        assert_eq!(answer["at"], Value::Null);
+    };
+    problem_with("401 Unauthorized: unknown token");
+    std::fs::remove_file(&token).unwrap();
+    problem_with("cannot read ");
+    std::fs::write(&token, "second\n").unwrap();
+    let answer = fleet_of(&agent, |answer| answer["at"].is_number());
+    assert_eq!(answer["problem"], Value::Null);
 }

@@ -2,6 +2,7 @@
 
 use std::error::Error;
 use std::io;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::time::Duration;
 
@@ -16,6 +17,9 @@ use hyper_util::rt::TokioExecutor;
 use percent_encoding::{NON_ALPHANUMERIC, utf8_percent_encode};
 use serde::Deserialize;
 use tokio::time::timeout;
+
+use super::TOKEN_BYTES;
+use crate::file;
 
 /// Maximum wait for an answer.
 const TIMEOUT: Duration = Duration::from_secs(30);
@@ -44,7 +48,8 @@ pub(super) struct Labels {
 #[derive(Debug)]
 pub struct Engine {
     query: Uri,
-    token: Option<HeaderValue>,
+    /// File with a bearer token. Each query reads it, so that a replaced one applies at once.
+    token_file: Option<PathBuf>,
     /// Maximum length of an answer, in bytes.
     max_bytes: usize,
     client: HttpClient,
@@ -72,6 +77,14 @@ pub enum EngineError {
     /// The certificate authorities of this host cannot be read.
     #[error("cannot prepare the request")]
     Prepare(#[source] io::Error),
+    /// The file with the token cannot be read.
+    #[error("cannot read {}", path.display())]
+    TokenFile {
+        /// Path of the file.
+        path: PathBuf,
+        /// Error of the operating system.
+        source: io::Error,
+    },
     /// The token cannot be part of a request.
     #[error("the token is not one line of ASCII")]
     Token,
@@ -151,28 +164,44 @@ pub fn is_engine(text: &str) -> bool {
 }
 
 impl Engine {
-    /// Creates a client of the engine at a URL, with a bearer token if it demands one. It refuses
-    /// longer answers.
+    /// Creates a client of the engine at a URL. With a file, requests have its bearer token. The
+    /// client refuses answers that are longer than `max_bytes`.
     ///
     /// # Errors
     ///
     /// Fails if the URL or the token is invalid.
-    pub fn new(url: &str, token: Option<&str>, max_bytes: usize) -> Result<Self, EngineError> {
+    pub fn new(
+        url: &str,
+        token_file: Option<&Path>,
+        max_bytes: usize,
+    ) -> Result<Self, EngineError> {
         let address: Address = url.parse()?;
-        let token = token.map(|token| -> Result<_, EngineError> {
-            let value = HeaderValue::try_from(format!("Bearer {}", token.trim()));
-            let mut value = value.map_err(|_| EngineError::Token)?;
-            value.set_sensitive(true);
-            Ok(value)
-        });
         let query = address.query();
         let client = HttpClient::of(&query).map_err(EngineError::Prepare)?;
-        Ok(Self {
+        let engine = Self {
             query,
-            token: token.transpose()?,
+            token_file: token_file.map(Path::to_owned),
             max_bytes,
             client,
-        })
+        };
+        engine.authorization()?;
+        Ok(engine)
+    }
+
+    /// Returns the value of `Authorization`.
+    fn authorization(&self) -> Result<Option<HeaderValue>, EngineError> {
+        let Some(path) = &self.token_file else {
+            return Ok(None);
+        };
+        let token = file::read_text(path, TOKEN_BYTES);
+        let token = token.map_err(|source| EngineError::TokenFile {
+            path: path.clone(),
+            source,
+        })?;
+        let value = HeaderValue::try_from(format!("Bearer {}", token.trim()));
+        let mut value = value.map_err(|_| EngineError::Token)?;
+        value.set_sensitive(true);
+        Ok(Some(value))
     }
 
     /// Returns the maximum number of series in all answers of a reading.
@@ -185,8 +214,8 @@ impl Engine {
     ///
     /// # Errors
     ///
-    /// Fails if the engine cannot be reached, if it refuses the query, or if its answer is too
-    /// large.
+    /// Fails if the token cannot be read, if the engine cannot be reached, if it refuses the query,
+    /// or if its answer is too large.
     pub(super) async fn query(
         &self,
         expression: &str,
@@ -201,8 +230,8 @@ impl Engine {
         headers.insert(CONTENT_TYPE, form);
         let agent = HeaderValue::from_static(concat!("rp/", env!("CARGO_PKG_VERSION")));
         headers.insert(USER_AGENT, agent);
-        if let Some(token) = &self.token {
-            headers.insert(AUTHORIZATION, token.clone());
+        if let Some(token) = self.authorization()? {
+            headers.insert(AUTHORIZATION, token);
         }
         let answered = async {
             let answer = self.client.request(request).await;

@@ -19,7 +19,6 @@ use std::sync::Arc;
 use ros2probe_ship::SettingsError;
 
 use crate::config::FleetSettings;
-use crate::file;
 pub use engine::{Engine, EngineError, InvalidAddress, MAX_BYTES, is_engine};
 pub use incidents::IncidentReader;
 pub use link::{InvalidLink, Link};
@@ -27,7 +26,7 @@ pub use reader::{Known, POLL_INTERVAL, Reader, Sources};
 pub use robot::{Question, read};
 
 /// Maximum size of the file with a token, in bytes.
-pub const TOKEN_BYTES: u64 = 64 << 10;
+const TOKEN_BYTES: u64 = 64 << 10;
 /// Maximum length of an answer of an engine to an agent, in bytes. While clients ask, memory holds
 /// the labels of eleven of them, and of each series what it means. The engine bounds their number.
 const AGENT_ANSWER_BYTES: usize = 4 << 20;
@@ -36,17 +35,26 @@ const AGENT_ANSWER_BYTES: usize = 4 << 20;
 #[derive(Debug, thiserror::Error)]
 pub enum StartError {
     /// The file with the token cannot be read.
-    #[error("cannot read `fleet.token_file`")]
-    Token(#[source] io::Error),
-    /// The engine's address, the token or the certificate authorities are unusable.
+    #[error("cannot use `fleet.token_file`")]
+    Token(#[source] EngineError),
+    /// The engine's address or the certificate authorities are unusable.
     #[error(transparent)]
-    Engine(#[from] EngineError),
+    Engine(EngineError),
     /// The store's address is none.
     #[error("fleet.store")]
     Store(#[from] SettingsError),
     /// No runtime or thread starts.
     #[error("cannot start the thread that queries the engine")]
     Thread(#[source] io::Error),
+}
+
+impl From<EngineError> for StartError {
+    fn from(error: EngineError) -> Self {
+        match error {
+            EngineError::TokenFile { .. } | EngineError::Token => Self::Token(error),
+            error => Self::Engine(error),
+        }
+    }
 }
 
 /// Starts the thread that queries the configured engine on demand, with the privileges of exports.
@@ -62,10 +70,7 @@ pub fn start(
     let Some(url) = &settings.engine else {
         return Ok(None);
     };
-    let token = settings.token_file.as_deref();
-    let token = token.map(|path| file::read_text(path, TOKEN_BYTES));
-    let token = token.transpose().map_err(StartError::Token)?;
-    let engine = Engine::new(url, token.as_deref(), AGENT_ANSWER_BYTES)?;
+    let engine = Engine::new(url, settings.token_file.as_deref(), AGENT_ANSWER_BYTES)?;
     let incidents = settings.store.clone().map(IncidentReader::new);
     let sources = Sources {
         engine,
