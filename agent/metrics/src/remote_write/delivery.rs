@@ -278,8 +278,12 @@ impl<'a> Sender<'a> {
 
     /// Sends samples until the receiver has written or refused each of them.
     async fn settle(&mut self, batch: &[Arc<Scrape>]) {
-        // The oldest samples are in the last part.
-        let mut parts: Vec<_> = batch.chunks(self.carried).rev().collect();
+        // Samples of a series must be in the order of time (Remote-Write 1.0 and 2.0, "Ordering"), so
+        // a request ends where the clock was set back. The oldest samples are in the last part.
+        let steps = batch.chunk_by(|one, two| one.at < two.at);
+        let parts = steps.flat_map(|part| part.chunks(self.carried));
+        let mut parts: Vec<_> = parts.collect();
+        parts.reverse();
         while let Some(part) = parts.pop() {
             match self.send_until_settled(part).await {
                 Ok(()) => self
@@ -450,11 +454,28 @@ fn samples(part: &[Arc<Scrape>]) -> u64 {
 #[cfg(test)]
 mod tests {
     use std::io::{BufRead as _, BufReader, Read as _, Write as _};
-    use std::net::{TcpListener, TcpStream};
+    use std::net::{SocketAddr, TcpListener, TcpStream};
 
     use super::super::settings::RemoteWriteSettings;
     use super::*;
     use crate::otlp::{Host, ReadText};
+
+    /// Returns remote write to a receiver that answers within this time.
+    fn job(receiver: SocketAddr, timeout: Duration) -> Job {
+        let file = RemoteWriteSettings {
+            url: Some(format!("http://{receiver}/write")),
+            timeout,
+            ..RemoteWriteSettings::default()
+        };
+        let read: ReadText = |_, _| Err(std::io::ErrorKind::NotFound.into());
+        let settings = Settings::resolve(&file, read, &Host::default());
+        Job {
+            waiting: Waiting::default(),
+            figures: Arc::default(),
+            stop: CancellationToken::new(),
+            settings: Arc::new(settings.unwrap().unwrap()),
+        }
+    }
 
     /// Earlier, one request was repeated without end, and the receiver got no further samples.
     #[test]
@@ -468,21 +489,8 @@ mod tests {
                 std::thread::spawn(move || answer_small(stream, CARRIED_BYTES));
             }
         });
-        let file = RemoteWriteSettings {
-            url: Some(format!("http://{address}/write")),
-            timeout: Duration::from_millis(500),
-            ..RemoteWriteSettings::default()
-        };
-        let read: ReadText = |_, _| Err(std::io::ErrorKind::NotFound.into());
-        let settings = Settings::resolve(&file, read, &Host::default());
-        let settings = Arc::new(settings.unwrap().unwrap());
-        let client = Client::new(Arc::clone(&settings)).unwrap();
-        let job = Job {
-            waiting: Waiting::default(),
-            figures: Arc::default(),
-            stop: CancellationToken::new(),
-            settings,
-        };
+        let job = job(address, Duration::from_millis(500));
+        let client = Client::new(Arc::clone(&job.settings)).unwrap();
         let mut sender = Sender::new(&job, client);
         // Names that do not compress: some collections fit.
         let mut random = 1_u64;
@@ -505,6 +513,33 @@ mod tests {
         runtime.block_on(sender.settle(&batch));
         assert_eq!(job.figures.samples(SampleFate::Delivered), 20);
         assert!(job.figures.requests(Request::Retried) >= 1);
+    }
+
+    /// Earlier, one request had samples before and after the step, which the protocol forbids.
+    #[test]
+    fn a_request_ends_where_the_clock_was_set_back() {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let address = listener.local_addr().unwrap();
+        std::thread::spawn(move || {
+            for stream in listener.incoming() {
+                let stream = stream.unwrap();
+                std::thread::spawn(move || answer_small(stream, usize::MAX));
+            }
+        });
+        let job = job(address, Duration::from_secs(60));
+        let client = Client::new(Arc::clone(&job.settings)).unwrap();
+        let mut sender = Sender::new(&job, client);
+        // Two steps back, and a step forward, after which the order is right again.
+        let times = [10, 20, 30, 12, 22, 90, 91, 91];
+        let scrape = |at: i64| {
+            let samples = vec![(vec![b'g', b'a', 0xff].into(), 0.0)];
+            Arc::new(Scrape { at, samples })
+        };
+        let batch: Vec<_> = times.into_iter().map(scrape).collect();
+        let runtime = Builder::new_current_thread().enable_all().build().unwrap();
+        runtime.block_on(sender.settle(&batch));
+        assert_eq!(job.figures.samples(SampleFate::Delivered), 8);
+        assert_eq!(job.figures.requests(Request::Delivered), 3);
     }
 
     /// Answers requests of a connection; larger ones only when the client has given up.
