@@ -15,6 +15,7 @@ use std::time::Duration;
 use anyhow::{Context as _, Result, ensure};
 use clap::Parser;
 use ros2probe_testing::harness::agent::{Agent, get};
+use ros2probe_testing::harness::alertmanager::with_own_files;
 use ros2probe_testing::harness::loss::Loss;
 use ros2probe_testing::harness::network::{Link, Namespace, Uplink};
 use ros2probe_testing::harness::process::Process;
@@ -204,29 +205,6 @@ fn engines(centre: &Namespace, directory: &Path) -> Result<Vec<Process>> {
         started.with_context(|| format!("{program}: run `.ci/prerequisites.sh fleet`"))
     });
     started.collect()
-}
-
-/// Returns the command prefix of a program that was unpacked but not installed, and reads files in
-/// `/usr/share`: it sees its own there.
-fn with_own_files(program: &str) -> Vec<String> {
-    let path = std::env::var_os("PATH").unwrap_or_default();
-    let found = std::env::split_paths(&path).find(|directory| directory.join(program).exists());
-    let share = found
-        .as_deref()
-        .and_then(Path::parent)
-        .map(|root| root.join("share"));
-    match share {
-        Some(share) if share != Path::new("/usr/share") && share.join("prometheus").exists() => {
-            let script = format!(
-                "mount -t overlay overlay -o lowerdir={}:/usr/share /usr/share && exec \"$0\" \"$@\"",
-                share.display()
-            );
-            ["unshare", "--mount", "sh", "-c", &script]
-                .map(str::to_owned)
-                .into()
-        }
-        _ => Vec::new(),
-    }
 }
 
 /// Starts the agent of a robot. Its watchlist is the default one, with an expectation.

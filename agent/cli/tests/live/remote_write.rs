@@ -3,12 +3,13 @@
 use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::io::{BufRead as _, BufReader};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context as _, Result, ensure};
 use ros2probe_testing::harness::agent::{Agent, Scrape, datagrams_alone_of, get};
+use ros2probe_testing::harness::alertmanager::{ALERTING, Alertmanager};
 use ros2probe_testing::harness::loss::Loss;
 use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::process::Process;
@@ -25,6 +26,11 @@ const GAP: f64 = 6.0;
 /// Robots in the summary of `make fleet`, and what it prints about the second one.
 const FLEET: [&str; 3] = ["robot-1 ", "robot-2  violated", "robot-3 "];
 const LOSES: &str = "  /points: max_loss_ratio is violated\n";
+/// Alerts about the faults among ten robots, with the robots.
+const FAULTS: [(&str, &str); 2] = [
+    ("Ros2probeGone", "robot-3"),
+    ("Ros2probeConfigurationRefused", "robot-5"),
+];
 /// A series that the agent always has.
 const UP: &str = "up{job=\"ros2probe\",instance=\"robot7\",site=\"hall 2\"}";
 
@@ -44,31 +50,40 @@ fn victoria_metrics_gets_the_samples_of_an_outage_in_which_the_agent_was_killed(
 }
 
 #[test]
-fn rp_fleet_finds_the_differing_robots_among_ten() -> Result<()> {
+fn rp_fleet_finds_the_differing_robots_among_ten_and_each_fault_has_one_alert() -> Result<()> {
     let centre = Namespace::isolated()?;
-    let prometheus = Prometheus::run(&centre, Kind::Server, "global: {scrape_interval: 1s}\n")?;
     let directory = tempfile::tempdir()?;
-    let mut robots = BTreeMap::new();
-    for number in 1..=10 {
-        let name = format!("robot-{number}");
+    let alertmanager = Alertmanager::start(&centre)?;
+    let alerts = quick_alerts(directory.path())?;
+    let text = format!(
+        "global: {{scrape_interval: 1s, evaluation_interval: 1s}}\n\
+         rule_files: ['{}']\n{ALERTING}",
+        alerts.display()
+    );
+    let prometheus = Prometheus::run(&centre, Kind::Server, &text)?;
+    let start = |name: &str| {
         // The seventh robot has another program.
-        let capture = match number {
-            7 => "wire/tests/data/fastdds-samehost-any.pcap.gz",
+        let capture = match name {
+            "robot-7" => "wire/tests/data/fastdds-samehost-any.pcap.gz",
             _ => "wire/tests/data/cyclonedds-samehost-any.pcap.gz",
         };
-        let configuration = directory.path().join(&name);
-        let text = format!(
-            "remote_write: {{url: 'http://127.0.0.1:9090/api/v1/write', interval_s: 1, \
-             instance: {name}}}\n"
-        );
-        std::fs::write(&configuration, text)?;
         let arguments = ["run", "--foxglove", "off", "--api", "off"]
             .into_iter()
             .chain(["--metrics", "127.0.0.1:0", "--config"])
             .map(OsString::from)
-            .chain([configuration.into(), "--replay".into()])
+            .chain([directory.path().join(name).into(), "--replay".into()])
             .chain([ros2probe_testing::repository(capture).into()]);
-        let agent = Process::start(&centre.outside(), env!("CARGO_BIN_EXE_rp"), arguments)?;
+        Process::start(&centre.outside(), env!("CARGO_BIN_EXE_rp"), arguments)
+    };
+    let mut robots = BTreeMap::new();
+    for number in 1..=10 {
+        let name = format!("robot-{number}");
+        let text = format!(
+            "remote_write: {{url: 'http://127.0.0.1:9090/api/v1/write', interval_s: 1, \
+             instance: {name}}}\n"
+        );
+        std::fs::write(directory.path().join(&name), text)?;
+        let agent = start(&name)?;
         robots.insert(name, agent);
     }
     prometheus.wait_for("count(ros2probe_ready{job=\"ros2probe\"} == 1)", 10.0)?;
@@ -77,6 +92,10 @@ fn rp_fleet_finds_the_differing_robots_among_ten() -> Result<()> {
     if let Some(mut third) = robots.remove("robot-3") {
         third.terminate()?;
     }
+    let configuration = directory.path().join("robot-5");
+    let accepted = std::fs::read_to_string(&configuration)?;
+    std::fs::write(&configuration, "no_such_key: true\n")?;
+    robots["robot-5"].signal("HUP")?;
     let fleet = |more: &[&str]| -> Result<(Option<i32>, String)> {
         let outside = centre.outside();
         let mut command = std::process::Command::new(&outside[0]);
@@ -136,7 +155,36 @@ fn rp_fleet_finds_the_differing_robots_among_ten() -> Result<()> {
         code == Some(1) && text.contains("has no robots of the job `other`"),
         "{text}"
     );
+    // Both faults end. Each caused one notification of its begin, and one of its end.
+    for (alert, robot) in FAULTS {
+        alertmanager.wait_for(alert, robot, &["firing"])?;
+    }
+    std::fs::write(&configuration, accepted)?;
+    robots["robot-5"].signal("HUP")?;
+    robots.insert("robot-3".to_owned(), start("robot-3")?);
+    for (alert, robot) in FAULTS {
+        alertmanager.wait_for(alert, robot, &["firing", "resolved"])?;
+        let named = alertmanager.robots_with(alert);
+        ensure!(named == [robot], "{alert}: {named:?}");
+    }
     Ok(())
+}
+
+/// Writes the shipped alerts with a short `for`, and returns their file.
+fn quick_alerts(directory: &Path) -> Result<PathBuf> {
+    let shipped = ros2probe_testing::repository("dashboards/rules/ros2probe.alerts.yaml");
+    let shipped = std::fs::read_to_string(shipped)?;
+    let text: String = shipped
+        .lines()
+        .map(|line| match line.starts_with("        for: ") {
+            true => "        for: 2s\n".to_owned(),
+            false => format!("{line}\n"),
+        })
+        .collect();
+    ensure!(text != shipped, "no alert waits");
+    let file = directory.join("alerts.yaml");
+    std::fs::write(&file, text)?;
+    Ok(file)
 }
 
 /// Checks that the page of `rp fleet` has the same robots as its text.

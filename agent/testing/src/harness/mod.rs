@@ -6,6 +6,7 @@
 //! the package to install; it never skips.
 
 pub mod agent;
+pub mod alertmanager;
 pub mod bpf;
 pub mod capture;
 pub mod cgroup;
