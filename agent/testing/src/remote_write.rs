@@ -118,7 +118,16 @@ impl Receiver {
     /// Starts a receiver on a free port of this host.
     #[must_use]
     pub fn start(answer: impl FnMut(&Write) -> Reply + Send + 'static) -> Self {
-        Self::listen(None, answer)
+        Self::listen(free_port(), None, answer)
+    }
+
+    /// Starts a receiver on a listener, such as that of another host.
+    #[must_use]
+    pub fn start_on(
+        listener: std::net::TcpListener,
+        answer: impl FnMut(&Write) -> Reply + Send + 'static,
+    ) -> Self {
+        Self::listen(listener, None, answer)
     }
 
     /// Starts a receiver with TLS.
@@ -127,10 +136,15 @@ impl Receiver {
         config: ServerConfig,
         answer: impl FnMut(&Write) -> Reply + Send + 'static,
     ) -> Self {
-        Self::listen(Some(TlsAcceptor::from(Arc::new(config))), answer)
+        Self::listen(
+            free_port(),
+            Some(TlsAcceptor::from(Arc::new(config))),
+            answer,
+        )
     }
 
     fn listen(
+        listener: std::net::TcpListener,
         tls: Option<TlsAcceptor>,
         answer: impl FnMut(&Write) -> Reply + Send + 'static,
     ) -> Self {
@@ -139,14 +153,15 @@ impl Receiver {
             .enable_all()
             .build()
             .unwrap();
-        let listener = runtime.block_on(TcpListener::bind("127.0.0.1:0")).unwrap();
         let address = listener.local_addr().unwrap();
+        listener.set_nonblocking(true).unwrap();
         let state = Arc::new(Mutex::new(State {
             answer: Box::new(answer),
             stored: Vec::new(),
         }));
         let shared = Arc::clone(&state);
         runtime.spawn(async move {
+            let listener = TcpListener::from_std(listener).unwrap();
             loop {
                 let (stream, _) = listener.accept().await.unwrap();
                 tokio::spawn(serve(stream, tls.clone(), Arc::clone(&shared)));
@@ -192,6 +207,10 @@ impl Receiver {
             std::thread::sleep(Duration::from_millis(20));
         }
     }
+}
+
+fn free_port() -> std::net::TcpListener {
+    std::net::TcpListener::bind("127.0.0.1:0").unwrap()
 }
 
 async fn serve(stream: TcpStream, tls: Option<TlsAcceptor>, state: Arc<Mutex<State>>) {

@@ -173,7 +173,7 @@ const fn uncertainty_of(stack: Stack) -> f64 {
 }
 
 /// Returns libfaketime for programs with several threads.
-fn library() -> Result<PathBuf> {
+pub(crate) fn library() -> Result<PathBuf> {
     let mut directories = std::fs::read_dir("/usr/lib")?;
     let file = directories.find_map(|entry| {
         let file = entry.ok()?.path().join("faketime/libfaketimeMT.so.1");

@@ -2,19 +2,26 @@
 
 use std::collections::BTreeMap;
 use std::ffi::OsString;
+use std::fs::Permissions;
 use std::io::{BufRead as _, BufReader};
+use std::net::TcpListener;
+use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context as _, Result, ensure};
-use ros2probe_testing::harness::agent::{Agent, Scrape, datagrams_alone_of, get};
+use ros2probe_capture::netns;
+use ros2probe_testing::harness::agent::{
+    Agent, Scrape, at_the_sockets_of, datagrams_alone_of, get,
+};
 use ros2probe_testing::harness::alertmanager::{ALERTING, Alertmanager};
 use ros2probe_testing::harness::loss::Loss;
 use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::prometheus::{Kind, Prometheus};
 use ros2probe_testing::harness::{run, wait_within};
+use ros2probe_testing::remote_write::{Receiver, Reply, Write};
 use serde_json::json;
 
 use crate::browser::player::play;
@@ -26,6 +33,10 @@ const GAP: f64 = 6.0;
 /// Robots in the summary of `make fleet`, and what it prints about the second one.
 const FLEET: [&str; 3] = ["robot-1 ", "robot-2  violated", "robot-3 "];
 const LOSES: &str = "  /points: max_loss_ratio is violated\n";
+/// Age of the oldest samples that the receiver does not have, in seconds.
+const BEHIND: &str = "ros2probe_remote_write_behind_seconds";
+/// Seconds by which the clock is set forward, and later back from the right time.
+const CLOCK_STEP: f64 = 1800.0;
 /// Alerts about the faults among ten robots, with the robots.
 const FAULTS: [(&str, &str); 2] = [
     ("Ros2probeGone", "robot-3"),
@@ -352,12 +363,6 @@ fn samples_survive(engine: Kind, text: &str) -> Result<()> {
     // The agent comes first, and the engine later.
     let mut agent = start()?;
     let began = Instant::now();
-    let behind = |age: f64| {
-        move |page: &Scrape| {
-            let behind = page.value("ros2probe_remote_write_behind_seconds", &[]);
-            behind.is_some_and(|behind| behind > age)
-        }
-    };
     agent.scrape_until("samples that wait", behind(2.0))?;
     let engine = Prometheus::run(&link.monitor, engine, text)?;
     engine.query(UP)?;
@@ -365,10 +370,7 @@ fn samples_survive(engine: Kind, text: &str) -> Result<()> {
     let to_engine = format!("ip daddr {}", link.monitor.address());
     let outage = Loss::of(&link.robot, &to_engine, 1000)?;
     agent.scrape_until("samples that wait", behind(4.0))?;
-    let queue = agent.scrape_until("a queue on disk", |page| {
-        let bytes = page.value("ros2probe_remote_write_queue_bytes", &[]);
-        bytes.is_some_and(|bytes| bytes > 0.0)
-    })?;
+    let queue = agent.scrape_until("a queue on disk", |page| queue_bytes(page) > 0.0)?;
     agent.process.signal("KILL")?;
     agent.process.wait(PATIENCE)?;
     let killed = now()?;
@@ -408,6 +410,200 @@ fn samples_survive(engine: Kind, text: &str) -> Result<()> {
         let samples = page.value("ros2probe_remote_write_samples_total", &[("outcome", lost)]);
         ensure!(samples == Some(0.0), "{lost}: {samples:?}");
     }
+    Ok(())
+}
+
+/// Returns whether a page shows samples of this age, in seconds, that the receiver does not have.
+fn behind(age: f64) -> impl Fn(&Scrape) -> bool {
+    move |page| page.value(BEHIND, &[]).is_some_and(|behind| behind > age)
+}
+
+fn queue_bytes(page: &Scrape) -> f64 {
+    let bytes = page.value("ros2probe_remote_write_queue_bytes", &[]);
+    bytes.unwrap_or_default()
+}
+
+fn samples(page: &Scrape, outcome: &str) -> f64 {
+    let labels = [("outcome", outcome)];
+    let samples = page.value("ros2probe_remote_write_samples_total", &labels);
+    samples.unwrap_or(f64::NAN)
+}
+
+/// Waits until the agent has written further collections to disk.
+fn collect_on_disk(agent: &Agent<'_>) -> Result<()> {
+    for _ in 0..3 {
+        let bytes = queue_bytes(&agent.scrape()?);
+        agent.scrape_until("a further collection", |page| queue_bytes(page) > bytes)?;
+    }
+    Ok(())
+}
+
+/// Writes a script that runs `rp` with the clock of a file, in the notation of libfaketime.
+fn write_program_with_clock(script: &Path, clock: &Path) -> Result<()> {
+    let text = format!(
+        "#!/bin/sh\nexport LD_PRELOAD={} FAKETIME_TIMESTAMP_FILE={} FAKETIME_NO_CACHE=1 \
+         FAKETIME_DONT_FAKE_MONOTONIC=1 FAKETIME_DONT_RESET=1\nexec {} \"$@\"\n",
+        crate::clocks::library()?.display(),
+        clock.display(),
+        env!("CARGO_BIN_EXE_rp")
+    );
+    std::fs::write(script, text)?;
+    std::fs::set_permissions(script, Permissions::from_mode(0o755))?;
+    Ok(())
+}
+
+/// A full disk in place of a directory, until the value is dropped.
+struct FullDisk(PathBuf);
+
+impl FullDisk {
+    fn over(directory: PathBuf) -> Result<Self> {
+        run(&format!(
+            "mount -t tmpfs -o size=4k full {}",
+            directory.display()
+        ))?;
+        Ok(Self(directory))
+    }
+}
+
+impl Drop for FullDisk {
+    fn drop(&mut self) {
+        let _ = run(&format!("umount -l {}", self.0.display()));
+    }
+}
+
+/// The receiver fails and refuses, the disk is full, the agent is killed, and the clock is
+/// set forward and back. The receiver is one of the tests, because it keeps each request.
+#[test]
+fn a_receiver_has_each_sample_once_and_in_order_after_all_faults_together() -> Result<()> {
+    let host = Namespace::isolated()?;
+    let listener = netns::within(&host.network(), || TcpListener::bind("127.0.0.1:9090"))??;
+    let receiver = Receiver::start_on(listener, Reply::stored);
+    let directory = tempfile::tempdir()?;
+    let path = |name: &str| directory.path().join(name);
+    std::fs::create_dir(path("state"))?;
+    let configuration = path("ros2probe.yaml");
+    let text = format!(
+        "{}state_directory: {}\n\
+         remote_write: {{url: 'http://127.0.0.1:9090/api/v1/write', interval_s: 1, \
+         instance: robot7}}\n",
+        at_the_sockets_of(&host),
+        path("state").display()
+    );
+    std::fs::write(&configuration, text)?;
+    // A replaced file is never empty.
+    let set_clock = |offset: &str| {
+        std::fs::write(path("clock.new"), offset)?;
+        std::fs::rename(path("clock.new"), path("clock"))
+    };
+    set_clock("+0")?;
+    write_program_with_clock(&path("rp"), &path("clock"))?;
+    let start = || Agent::start(&host, path("rp"), &configuration);
+    let begun = now()?;
+    let mut agent = start()?;
+    receiver.wait_for("samples", |stored| stored.len() > 2);
+
+    let mut failures = [500, 429, 401, 503].into_iter().cycle();
+    receiver.answer(move |_| Reply {
+        headers: vec![("Retry-After", "1".to_owned())],
+        ..Reply::status(failures.next().unwrap_or(500))
+    });
+    agent.scrape_until("samples that wait", behind(4.0))?;
+    set_clock(&format!("+{CLOCK_STEP}"))?;
+    collect_on_disk(&agent)?;
+    let full = FullDisk::over(path("state").join("remote_write"))?;
+    let page = agent.scrape()?;
+    let age = page.value(BEHIND, &[]).context("no age")?;
+    let page = agent.scrape_until("samples in memory", behind(age + 2.0))?;
+    let later = agent.scrape_until("further ones", behind(age + 5.0))?;
+    ensure!(
+        queue_bytes(&later) == queue_bytes(&page),
+        "the disk is not full"
+    );
+    drop(full);
+    collect_on_disk(&agent)?;
+    agent.process.signal("KILL")?;
+    agent.process.wait(PATIENCE)?;
+    let before = receiver.stored().len();
+    let agent = start()?;
+    collect_on_disk(&agent)?;
+    set_clock(&format!("-{CLOCK_STEP}"))?;
+    collect_on_disk(&agent)?;
+
+    // The receiver is back, but refuses one collection: "too old".
+    let mut refused = None;
+    receiver.answer(move |write| {
+        let times = write.of("up");
+        if times.len() > 2 {
+            refused.get_or_insert(times[times.len() / 2].0);
+        }
+        match times.iter().any(|(at, _)| Some(*at) == refused) {
+            true => Reply::status(400),
+            false => Reply::stored(write),
+        }
+    });
+    let mut last = (0.0, 0);
+    let same = wait_within(
+        PATIENCE,
+        "the count of the robot and of the receiver",
+        || {
+            let page = agent.scrape()?;
+            let stored = receiver.stored().split_off(before);
+            last = (
+                samples(&page, "delivered"),
+                stored.iter().map(Write::samples).sum::<usize>(),
+            );
+            Ok(queue_bytes(&page) == 0.0 && last.1 > 0 && last.0 == last.1 as f64)
+        },
+    );
+    same.with_context(|| format!("{last:?}"))?;
+    let page = agent.scrape()?;
+    let width = receiver
+        .stored()
+        .iter()
+        .map(|write| write.series.len())
+        .max();
+    let width = width.context("nothing stored")? as f64;
+    let lost = samples(&page, "refused");
+    ensure!(0.0 < lost && lost < width * 1.2, "{lost} of {width}");
+    for outcome in ["overflow", "shutdown"] {
+        ensure!(samples(&page, outcome) == 0.0, "{}", page.0);
+    }
+    each_collection_came_once(&receiver, begun)
+}
+
+/// Checks the order and the gaps of the collections, and a figure that each of them has.
+fn each_collection_came_once(receiver: &Receiver, begun: f64) -> Result<()> {
+    let up = receiver.of("up");
+    // Number of the steps by which the clock was wrong.
+    let steps = |at: i64| ((at as f64 / 1e3 - begun) / CLOCK_STEP).round() as i64;
+    let mut clocks: Vec<_> = up.iter().map(|(at, _)| steps(*at)).collect();
+    clocks.dedup();
+    ensure!(clocks == [0, 1, -1], "{clocks:?}: {up:?}");
+    let mut wide = 0;
+    for pair in up.windows(2) {
+        let gap = (pair[1].0 - pair[0].0) as f64 / 1e3;
+        if steps(pair[0].0) == steps(pair[1].0) {
+            ensure!(gap > 0.0, "{pair:?} in {up:?}");
+            wide += usize::from(gap > GAP);
+        }
+    }
+    // One while no agent ran, and one of the refused collection.
+    ensure!(wide <= 2, "{wide} gaps in {up:?}");
+    let ages = receiver.of(BEHIND);
+    let times = |samples: &[(i64, f64)]| samples.iter().map(|(at, _)| *at).collect::<Vec<_>>();
+    ensure!(times(&ages) == times(&up), "{ages:?}");
+    // While the clock was ahead, the age grew from one collection on, also after the restart.
+    let ahead = ages.iter().filter(|(at, _)| steps(*at) == 1);
+    let oldest: Vec<f64> = ahead.map(|(at, age)| *at as f64 / 1e3 - age).collect();
+    let first = up.iter().filter(|(at, _)| steps(*at) == 0);
+    let first: Vec<f64> = first.map(|(at, _)| *at as f64 / 1e3).collect();
+    let is_first = |time: &&f64| first.iter().any(|first| (first - **time).abs() < GAP);
+    let right = oldest.iter().filter(is_first).count();
+    // The clock may be set within a collection, and the first one may precede the first request.
+    ensure!(
+        right >= 5 && right + 2 >= oldest.len(),
+        "{right} of {oldest:?}"
+    );
     Ok(())
 }
 
