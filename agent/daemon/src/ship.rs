@@ -1,6 +1,6 @@
 //! Settings of `rp ship`, from the configuration that it shares with the agent.
 
-use ros2probe_metrics::otlp::Host;
+use ros2probe_metrics::otlp::{Host, NoHardware};
 use ros2probe_ship::{RECORDS_DIRECTORY, Settings, SpaceLimits, StoreSettings};
 
 use crate::config::{Config, StateChoice};
@@ -21,6 +21,9 @@ pub enum NoShip {
     /// The robot has no name.
     #[error("this host has no name: set `ship.instance`")]
     Instance,
+    /// The name of the robot stands for hardware that this host does not have.
+    #[error(transparent)]
+    Hardware(#[from] NoHardware),
 }
 
 /// Returns the settings of a delivery.
@@ -38,8 +41,10 @@ pub fn settings(config: &Config) -> Result<Settings, NoShip> {
     };
     let instance = ship.instance.as_ref();
     let instance = instance.or(config.remote_write.instance.as_ref());
-    let instance = instance.or(config.otlp.robot.as_ref()).cloned();
-    let instance = instance.or_else(|| Host::read().name);
+    let instance = instance.or(config.otlp.robot.as_ref());
+    let host = Host::read();
+    let instance = instance.map(|name| host.named(name)).transpose()?;
+    let instance = instance.or(host.name);
     let limits = &config.recordings.limits;
     Ok(Settings {
         store: StoreSettings {

@@ -1,12 +1,14 @@
 //! The resource: attributes that all points, records and spans of this agent share.
 
 use std::fs;
+use std::path::Path;
 
 use opentelemetry::{KeyValue, Value};
 use opentelemetry_sdk::Resource;
 use opentelemetry_sdk::resource::{EnvResourceDetector, ResourceDetector as _};
 use percent_encoding::percent_decode_str;
 
+use super::hardware::{self, NoHardware};
 use super::settings::OtlpSettings;
 use ros2probe_model::facts::identity::Identity;
 
@@ -17,6 +19,10 @@ pub struct Host {
     pub name: Option<String>,
     /// Machine id, which does not change with the name.
     pub id: Option<String>,
+    /// Serial number of the board, which does not change with the image.
+    pub serial: Option<String>,
+    /// Address of its first network interface, which does not change with the image.
+    pub mac: Option<String>,
 }
 
 impl Host {
@@ -31,6 +37,8 @@ impl Host {
         Self {
             name: line("/proc/sys/kernel/hostname"),
             id: line("/etc/machine-id").or_else(|| line("/var/lib/dbus/machine-id")),
+            serial: hardware::serial(Path::new("/sys")),
+            mac: hardware::mac(Path::new("/sys")),
         }
     }
 
@@ -46,12 +54,15 @@ impl Host {
 
 /// Returns the resource for `host`. Attributes of the environment override those of the host, and
 /// attributes of the file override both.
-pub(super) fn resource(host: &Host, file: &OtlpSettings) -> Resource {
+///
+/// Fails if the name of the robot stands for hardware that this host does not have.
+pub(super) fn resource(host: &Host, file: &OtlpSettings) -> Result<Resource, NoHardware> {
     let of_host = [("host.name", &host.name), ("host.id", &host.id)];
     let of_host = of_host
         .into_iter()
         .filter_map(|(key, value)| Some(KeyValue::new(key, value.clone()?)));
-    let robot = file.robot.iter().map(|robot| ("robot.name", robot.clone()));
+    let robot = file.robot.as_deref().map(|robot| host.named(robot));
+    let robot = robot.transpose()?.map(|robot| ("robot.name", robot));
     let of_file = file.attributes.iter();
     let of_file = of_file.map(|(key, value)| KeyValue::new(key.clone(), value.clone()));
     let resource = Resource::builder_empty()
@@ -70,7 +81,7 @@ pub(super) fn resource(host: &Host, file: &OtlpSettings) -> Resource {
     let kept = resource.iter();
     let kept = kept.filter(|(_, value)| !value.as_str().is_empty());
     let kept = kept.map(|(key, value)| KeyValue::new(key.clone(), value.clone()));
-    Resource::builder_empty().with_attributes(kept).build()
+    Ok(Resource::builder_empty().with_attributes(kept).build())
 }
 
 /// Returns the attributes of `OTEL_RESOURCE_ATTRIBUTES`. The SDK leaves their values
@@ -119,6 +130,7 @@ mod tests {
         let host = |id: &str| Host {
             name: Some("robot-7".to_owned()),
             id: Some(id.to_owned()),
+            ..Host::default()
         };
         let one = instance(&host("0123456789abcdef0123456789abcdef"));
         assert_eq!(one, instance(&host("0123456789abcdef0123456789abcdef")));
@@ -145,9 +157,9 @@ mod tests {
         };
         let host = Host {
             name: Some("robot-7".to_owned()),
-            id: None,
+            ..Host::default()
         };
-        let resource = resource(&host, &file);
+        let resource = resource(&host, &file).unwrap();
         let mut attributes: Vec<_> = resource
             .iter()
             .map(|(key, value)| (key.as_str(), value.as_str().into_owned()))

@@ -19,6 +19,7 @@ use tracing_subscriber::filter::LevelFilter;
 
 use super::endpoint::otlp_endpoint;
 use super::exports::Signal;
+use super::hardware::NoHardware;
 use super::headers::Headers;
 use super::resource::{Host, resource};
 
@@ -167,6 +168,9 @@ pub enum SettingsError {
         /// Error of the operating system.
         source: io::Error,
     },
+    /// The robot has no name.
+    #[error("otlp.robot")]
+    Robot(#[source] NoHardware),
     /// The connection cannot be configured.
     #[error("the OTLP connection cannot be set up")]
     Client(#[source] tonic::transport::Error),
@@ -183,7 +187,7 @@ impl Settings {
     /// reads the file with headers.
     ///
     /// # Errors
-    /// Fails if an endpoint or header is invalid.
+    /// Fails if an endpoint, a header or the name of the robot is invalid.
     pub fn resolve(
         file: &OtlpSettings,
         environment: &dyn Fn(&str) -> Option<String>,
@@ -200,7 +204,7 @@ impl Settings {
         }
         let target = |signal| target(file, &variables, read, signal);
         let settings = Self {
-            resource: resource(host, file),
+            resource: resource(host, file).map_err(SettingsError::Robot)?,
             host: host.bits(),
             interval: file.interval.unwrap_or_else(|| {
                 let variable = variables.find("OTEL_METRIC_EXPORT_INTERVAL");

@@ -269,7 +269,7 @@ mod tests {
         };
         let host = Host {
             name: Some("robot-7".to_owned()),
-            id: None,
+            ..Host::default()
         };
         let settings = Settings::resolve(&file, |path, _| std::fs::read_to_string(path), &host);
         Client::new(Arc::new(settings.unwrap().unwrap())).unwrap()

@@ -10,7 +10,7 @@ use hyper::Uri;
 use hyper::header::{HeaderName, HeaderValue};
 
 use super::request::Labels;
-use crate::otlp::{Host, ReadText};
+use crate::otlp::{Host, NoHardware, ReadText};
 
 /// Maximum size of a file with a token, certificates or a key, in bytes.
 const FILE_BYTES: u64 = 1 << 20;
@@ -76,6 +76,9 @@ pub enum SettingsError {
     /// A header cannot be sent.
     #[error("remote_write.headers: `{0}` is not a valid header")]
     Header(String),
+    /// The robot has no name.
+    #[error("remote_write.instance")]
+    Instance(#[source] NoHardware),
     /// Only one of the two files of a certificate is set.
     #[error("remote_write.certificate_file and remote_write.key_file must be set together")]
     HalfCertificate,
@@ -127,7 +130,7 @@ impl Settings {
     /// Checks the settings of `file`; returns `None` without a receiver. `read` reads the files.
     ///
     /// # Errors
-    /// Fails if the address or a header is invalid.
+    /// Fails if the address, a header or the name of the robot is invalid.
     pub fn resolve(
         file: &RemoteWriteSettings,
         read: ReadText,
@@ -147,7 +150,9 @@ impl Settings {
             (Some(certificate), Some(key)) => Some((certificate.clone(), key.clone())),
             _ => return Err(SettingsError::HalfCertificate),
         };
-        let instance = file.instance.clone().or_else(|| host.name.clone());
+        let instance = file.instance.as_deref().map(|name| host.named(name));
+        let instance = instance.transpose().map_err(SettingsError::Instance)?;
+        let instance = instance.or_else(|| host.name.clone());
         let mut labels = file.labels.clone();
         for (name, value) in [
             ("job", JOB_LABEL.to_owned()),
@@ -221,7 +226,7 @@ mod tests {
     fn resolve(file: &RemoteWriteSettings) -> Result<Option<Settings>, SettingsError> {
         let host = Host {
             name: Some("robot-7".to_owned()),
-            id: None,
+            ..Host::default()
         };
         Settings::resolve(file, |path, _| fs::read_to_string(path), &host)
     }
@@ -251,6 +256,20 @@ mod tests {
             ("site", "hall 2"),
         ];
         assert_eq!(labels(named), expected.map(pair));
+        let of_hardware = RemoteWriteSettings {
+            instance: Some("robot-{serial}".to_owned()),
+            ..to("http://a/api/v1/write")
+        };
+        let error = resolve(&of_hardware).unwrap_err();
+        assert!(matches!(error, SettingsError::Instance(_)), "{error}");
+        let read: ReadText = |path, _| fs::read_to_string(path);
+        let host = Host {
+            serial: Some("a1b2".to_owned()),
+            ..Host::default()
+        };
+        let settings = Settings::resolve(&of_hardware, read, &host);
+        let labels = settings.unwrap().unwrap().labels;
+        assert_eq!(labels[0], pair(("instance", "robot-a1b2")));
     }
 
     #[test]
