@@ -475,6 +475,27 @@ fn the_rate_of_bytes_is_limited() {
 }
 
 #[test]
+fn series_beyond_those_of_an_hour_are_omitted_and_counted() {
+    const LIMIT: usize = 50;
+    let directory = tempfile::tempdir().unwrap();
+    let receiver = Receiver::start(Reply::stored);
+    let more = format!(", max_new_series_per_hour: {LIMIT}");
+    let mut agent = sending(&receiver, directory.path(), &more);
+    let log = agent.wait_for_log("too many series begin in an hour");
+    assert!(log.contains("limit=50"), "{log}");
+    receiver.wait_for("samples", |stored| stored.len() > 3);
+    agent.wait_for_metric(&samples("series_limit"), |count| count > 100.0);
+    let stored = receiver.stored();
+    let series = stored.iter().flat_map(|write| &write.series);
+    let series: BTreeSet<&Labels> = series.map(|(labels, _)| labels).collect();
+    assert_eq!(series.len(), LIMIT);
+    // Those that began go on.
+    assert!(!stored.last().unwrap().of("up").is_empty());
+    let line = "too many series begin in an hour";
+    assert_eq!(agent.log().matches(line).count(), 1);
+}
+
+#[test]
 fn invalid_sections_are_refused_with_their_position() {
     let directory = tempfile::tempdir().unwrap();
     let configuration = directory.path().join("ros2probe.yaml");

@@ -368,6 +368,9 @@ impl Reader {
             key_file: shape.key_file.map(PathBuf::from),
             queue_bytes: shape.queue_bytes.unwrap_or(default.queue_bytes),
             max_bytes_per_second: shape.max_bytes_per_second,
+            max_new_series_per_hour: shape
+                .max_new_series_per_hour
+                .unwrap_or(default.max_new_series_per_hour),
         }
     }
 

@@ -729,6 +729,10 @@ pub(super) struct RemoteWriteShape {
     /// Maximum number of bytes of requests per second; by default they have no limit.
     #[schemars(range(min = 1_000, max = 1_000_000_000))]
     pub(super) max_bytes_per_second: Option<u64>,
+    /// Maximum number of series that begin in an hour; 0 = no limit, default 50000. Samples of
+    /// further ones are omitted, so that names with a UUID do not exhaust the receiver.
+    #[schemars(range(min = 0, max = 1_000_000))]
+    pub(super) max_new_series_per_hour: Option<u64>,
 }
 
 /// Delivery of finished bags by `rp ship`, a program of its own.

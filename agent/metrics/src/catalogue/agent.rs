@@ -277,7 +277,8 @@ pub const REMOTE_WRITE_REQUESTS: Metric = Metric::counter(
 pub const REMOTE_WRITE_SAMPLES: Metric = Metric::counter(
     "ros2probe_remote_write_samples_total",
     &["outcome"],
-    "Samples of remote write: delivered, refused, or lost by overflow (queue full) or shutdown.",
+    "Samples of remote write: delivered, refused, or lost by overflow (queue full), series_limit \
+     (too many new ones in an hour) or shutdown.",
 );
 pub const REMOTE_WRITE_SENT: Metric = Metric::counter(
     "ros2probe_remote_write_sent_bytes_total",

@@ -201,7 +201,7 @@ impl Job {
         // The offset spreads the requests of a fleet that was switched on simultaneously.
         let mut ticks = interval_at(tokio::time::Instant::now() + period / 4, period);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Skip);
-        let mut samples = Samples::default();
+        let mut samples = Samples::new(self.settings.max_new_series);
         let mut previous = Duration::ZERO;
         let mut last = 0;
         loop {
@@ -221,6 +221,8 @@ impl Job {
             let (scrape, refused) = samples.end(if at == last { at + 1 } else { at });
             last = scrape.at;
             self.figures.count_samples(SampleFate::Overflow, refused);
+            let omitted = samples.take_omitted();
+            self.figures.count_samples(SampleFate::SeriesLimit, omitted);
             self.add(scrape);
             if stops {
                 break;

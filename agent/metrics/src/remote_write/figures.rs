@@ -23,6 +23,8 @@ pub enum SampleFate {
     Refused,
     /// The queue was full.
     Overflow,
+    /// Too many series began in an hour.
+    SeriesLimit,
     /// The agent stopped, and no queue on disk kept it.
     Shutdown,
 }
@@ -56,10 +58,11 @@ impl Request {
 
 impl SampleFate {
     /// All fates.
-    pub const ALL: [Self; 4] = [
+    pub const ALL: [Self; 5] = [
         Self::Delivered,
         Self::Refused,
         Self::Overflow,
+        Self::SeriesLimit,
         Self::Shutdown,
     ];
 
@@ -70,6 +73,7 @@ impl SampleFate {
             Self::Delivered => "delivered",
             Self::Refused => "refused",
             Self::Overflow => "overflow",
+            Self::SeriesLimit => "series_limit",
             Self::Shutdown => "shutdown",
         }
     }

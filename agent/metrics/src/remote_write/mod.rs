@@ -8,6 +8,7 @@ mod backlog;
 mod client;
 mod delivery;
 mod figures;
+mod new_series;
 mod record;
 mod request;
 pub(crate) mod samples;

@@ -3,9 +3,11 @@
 use std::collections::HashMap;
 use std::fmt::{self, Write as _};
 use std::sync::Arc;
+use std::time::Instant;
 
 use ros2probe_model::facts::histogram::Histogram;
 
+use super::new_series::NewSeries;
 use crate::catalogue::{Kind, Metric};
 use crate::metric_sink::{Label, Number};
 
@@ -40,14 +42,27 @@ pub(crate) struct Samples {
     collected: Vec<(Key, f64)>,
     /// Samples that exceed [`MAX_SERIES`].
     refused: u64,
+    new_series: NewSeries,
+    /// Samples of series that [`NewSeries`] does not admit.
+    omitted: u64,
     key: Vec<u8>,
     text: String,
 }
 
 impl Samples {
+    /// Creates a collector without series, of which at most this number begins in an hour; zero =
+    /// no limit.
+    pub(super) fn new(max_new_series: usize) -> Self {
+        Self {
+            new_series: NewSeries::new(max_new_series),
+            ..Self::default()
+        }
+    }
+
     /// Begins a collection.
     pub(super) fn begin(&mut self) {
         self.collection += 1;
+        self.new_series.at(Instant::now());
         self.collected = Vec::with_capacity(self.known.len());
         self.key.clear();
         self.key.push(kind(Kind::Gauge));
@@ -67,6 +82,11 @@ impl Samples {
             continues
         });
         (Scrape { at, samples }, std::mem::take(&mut self.refused))
+    }
+
+    /// Returns the number of samples that were omitted since the last call.
+    pub(super) fn take_omitted(&mut self) -> u64 {
+        std::mem::take(&mut self.omitted)
     }
 
     /// Returns the end of all series.
@@ -154,11 +174,15 @@ impl Samples {
     fn add(&mut self, value: f64) {
         let key = match self.known.get_key_value(self.key.as_slice()) {
             Some((key, _)) => Arc::clone(key),
-            None if self.known.len() < MAX_SERIES => Arc::from(self.key.as_slice()),
-            None => {
+            None if self.known.len() >= MAX_SERIES => {
                 self.refused += 1;
                 return;
             }
+            None if !self.new_series.admit(&self.key) => {
+                self.omitted += 1;
+                return;
+            }
+            None => Arc::from(self.key.as_slice()),
         };
         self.known.insert(Arc::clone(&key), self.collection);
         self.collected.push((key, value));

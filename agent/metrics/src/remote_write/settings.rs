@@ -44,6 +44,8 @@ pub struct RemoteWriteSettings {
     pub queue_bytes: u64,
     /// Maximum number of bytes sent per second; `None` = no limit.
     pub max_bytes_per_second: Option<u64>,
+    /// Maximum number of series that begin in an hour; zero = no limit.
+    pub max_new_series_per_hour: u64,
 }
 
 /// Checked settings.
@@ -61,6 +63,7 @@ pub struct Settings {
     pub(super) certificate: Option<(PathBuf, PathBuf)>,
     pub(super) queue_bytes: u64,
     pub(super) max_bytes_per_second: Option<u64>,
+    pub(super) max_new_series: usize,
     read: ReadText,
 }
 
@@ -122,6 +125,7 @@ impl Default for RemoteWriteSettings {
             key_file: None,
             queue_bytes: 256 << 20,
             max_bytes_per_second: None,
+            max_new_series_per_hour: 50_000,
         }
     }
 }
@@ -171,6 +175,7 @@ impl Settings {
             certificate,
             queue_bytes: file.queue_bytes,
             max_bytes_per_second: file.max_bytes_per_second,
+            max_new_series: usize::try_from(file.max_new_series_per_hour).unwrap_or(usize::MAX),
             read,
         }))
     }
