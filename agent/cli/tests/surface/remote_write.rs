@@ -368,6 +368,62 @@ fn a_replaced_token_applies_to_the_next_request() {
     );
 }
 
+#[test]
+fn a_robot_that_is_locked_out_stops_no_other_one_and_loses_nothing_if_it_returns() {
+    let directories = [tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap()];
+    let locked = Arc::new(Mutex::new(false));
+    let is_locked = Arc::clone(&locked);
+    let receiver = Receiver::start(move |write| match write.authorization.as_str() {
+        "Bearer stolen" if *is_locked.lock().unwrap() => Reply::status(403),
+        "Bearer stolen" | "Bearer other" => Reply::stored(write),
+        _ => Reply::status(401),
+    });
+    let start = |directory: &Path, token: &str| {
+        let file = directory.join("token");
+        std::fs::write(&file, token).unwrap();
+        sending(
+            &receiver,
+            directory,
+            &format!(", token_file: {}", file.display()),
+        )
+    };
+    let mut stolen = start(directories[0].path(), "stolen");
+    let _other = start(directories[1].path(), "other");
+    let of = |stored: &[Write], token: &str| -> Vec<i64> {
+        let header = format!("Bearer {token}");
+        let own = stored.iter().filter(|write| write.authorization == header);
+        own.flat_map(|write| write.of("up"))
+            .map(|(at, _)| *at)
+            .collect()
+    };
+    receiver.wait_for("samples of both", |stored| {
+        ["stolen", "other"]
+            .iter()
+            .all(|token| of(stored, token).len() > 2)
+    });
+    *locked.lock().unwrap() = true;
+    stolen.wait_for_log("403 Forbidden");
+    let stored = receiver.stored();
+    let (before, others) = (of(&stored, "stolen").len(), of(&stored, "other").len());
+    receiver.wait_for("samples of the other robot", |stored| {
+        of(stored, "other").len() > others + 3
+    });
+    assert_eq!(of(&receiver.stored(), "stolen").len(), before);
+    *locked.lock().unwrap() = false;
+    receiver.wait_for("samples of the robot that returned", |stored| {
+        of(stored, "stolen").len() > before + 3
+    });
+    for token in ["stolen", "other"] {
+        let times = of(&receiver.stored(), token);
+        let gaps: Vec<_> = times.windows(2).map(|pair| pair[1] - pair[0]).collect();
+        // A busy machine skips collections.
+        assert!(
+            gaps.iter().all(|gap| (1..6_000).contains(gap)),
+            "{token}: {gaps:?}"
+        );
+    }
+}
+
 /// Returns what an agent prints that cannot start.
 fn refused_to_start(receiver: &Receiver, directory: &Path, more: &str) -> String {
     let configuration = directory.join("wrong.yaml");
