@@ -256,8 +256,8 @@ fn value(samples: &[(Labels, f64)]) -> Option<f64> {
     samples.first().map(|(_, value)| *value)
 }
 
-/// Returns a name as it is on every robot: the robot's own name in it is `<robot>`, and a number that
-/// differs with each process or start is `<number>`.
+/// Returns a name as it is on every robot. The robot's own name in it is `<robot>`, and a number that
+/// differs with each process is `<number>`.
 fn common(name: &str, robot: &str) -> String {
     let tokens = name.split('/').map(|token| {
         if token == robot || token == robot.replace(['-', '.'], "_") {

@@ -324,8 +324,8 @@ fn failure(reason: String) -> OTelSdkResult {
 }
 
 /// Returns whether a status of HTTP concerns the credentials, the address or the state of the
-/// receiver, and not the items: all others would get it, too. OTLP 1.x lets a client repeat only 429
-/// and 502 to 504, but then an expired token or the portal of a network would cost all items.
+/// receiver. Other items would get it, too. OTLP 1.x lets a client repeat only 429 and 502 to 504. An
+/// expired token, or the portal of a network, would cost all items then.
 pub(super) const fn is_temporary(status: u16) -> bool {
     matches!(status, 300..=399 | 401 | 403 | 404 | 407 | 408 | 429 | 500..=599)
 }

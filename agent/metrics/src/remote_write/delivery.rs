@@ -280,8 +280,8 @@ impl<'a> Sender<'a> {
 
     /// Sends samples until the receiver has written or refused each of them.
     async fn settle(&mut self, batch: &[Arc<Scrape>]) {
-        // Samples of a series must be in the order of time (Remote-Write 1.0 and 2.0, "Ordering"), so
-        // a request ends where the clock was set back. The oldest samples are in the last part.
+        // Samples of a series must be in the order of time (Remote-Write 1.0 and 2.0, "Ordering"). A
+        // request ends where the clock was set back. The oldest samples are in the last part.
         let steps = batch.chunk_by(|one, two| one.at < two.at);
         let parts = steps.flat_map(|part| part.chunks(self.carried));
         let mut parts: Vec<_> = parts.collect();

@@ -1,5 +1,5 @@
-//! A bound of the series that begin in an hour. A receiver keeps each of them in memory for hours,
-//! so names that are new again and again, as those with a UUID, must not exhaust it.
+//! A bound of the series that begin in an hour. A receiver keeps each of them in memory for hours.
+//! Names that are new again and again, as those with a UUID, would exhaust it.
 
 use std::collections::HashSet;
 use std::hash::{BuildHasher as _, RandomState};
