@@ -173,9 +173,9 @@ fn point_clouds(stack: Stack, size: usize) -> Result<()> {
             assert_eq!(counted.recovered, 0, "{}", end.name);
             // Every sample whose last datagram left the publisher was seen at least in part.
             assert!(passed + counted.lost >= POINT_CLOUDS - 1, "{}", end.name);
-            // A sample is one record. Discovery and the stream's beginning are copied in addition,
-            // and the samples that are sent until the agent has read from a header which frame it
-            // names. A busy machine lets it wait for a sample or two.
+            // A sample is one record. Discovery and the stream's beginning are copied in addition.
+            // So are the samples that are sent until the agent has read from a header which frame
+            // it names. A busy machine lets it wait for a sample or two.
             let share = if size == 2_720_000 { 0.01 } else { 0.02 };
             let copied = end.scrape.sum("ros2probe_capture_copied_bytes_total", &[]);
             let traffic = counted.bytes as f64;

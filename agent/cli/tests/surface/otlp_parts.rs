@@ -1,5 +1,5 @@
-//! Requests of OTLP that are too large for a receiver or for a slow link arrive in parts, and those
-//! with an expired token arrive after its replacement. A replay has no queue on disk.
+//! Requests of OTLP that are too large for a receiver or for a slow link arrive in parts. Those with
+//! an expired token arrive after its replacement. A replay has no queue on disk.
 
 use std::collections::VecDeque;
 use std::convert::Infallible;

@@ -445,7 +445,7 @@ fn forged_input_fills_no_table_beyond_its_cap() {
     ]);
     assert!(whole < 96 << 20, "{whole} bytes");
 
-    let whole = drive(15_000, 1_000_000, &mut newcomers_in_a_crowd);
+    let whole = drive(24_000, 1_000_000, &mut newcomers_in_a_crowd);
     assert_filled(&["endpoints", "nodes"]);
     assert!(whole < 96 << 20, "{whole} bytes");
 
