@@ -2,7 +2,7 @@
 //! requests their announcements. All surfaces use this sentence and this command.
 
 use ros2probe_api::participants::{Participant, UnknownWriter};
-use ros2probe_model::report::snapshot::Snapshot;
+use ros2probe_model::report::snapshot::{ParticipantFacts, Snapshot};
 use ros2probe_wire::GuidPrefix;
 use ros2probe_wire::rtps::VendorId;
 
@@ -40,6 +40,15 @@ impl Announces {
             false => Self::Udp,
         }
     }
+
+    /// Returns how this participant of a snapshot does.
+    fn of_facts(participant: &ParticipantFacts) -> Self {
+        match participant.guid.prefix.is_zenoh() {
+            true => Self::Zenoh,
+            false if participant.announces_by_tcp => Self::Tcp,
+            false => Self::Udp,
+        }
+    }
 }
 
 /// Returns the command that requests announcements; `None` without any. Announcements by TCP are
@@ -59,8 +68,7 @@ pub fn command(announced: impl IntoIterator<Item = Announces>) -> Option<&'stati
     }
 }
 
-/// Returns the command that requests the announcements which the snapshot lacks: of its unknown
-/// writers, else of its participants if no topic is known.
+/// Returns the command that requests the announcements of the snapshot's unknown writers.
 #[must_use]
 pub fn remedy(snapshot: &Snapshot) -> Option<&'static str> {
     let announces = |prefix: GuidPrefix| {
@@ -68,16 +76,27 @@ pub fn remedy(snapshot: &Snapshot) -> Option<&'static str> {
         let known = participants.find(|participant| participant.guid.prefix == prefix);
         match prefix.is_zenoh() {
             true => Announces::Zenoh,
-            false if known.is_some_and(|known| known.announces_by_tcp) => Announces::Tcp,
-            false => Announces::Udp,
+            false => known.map_or(Announces::Udp, Announces::of_facts),
         }
     };
     let writers = snapshot.unknown_writers.iter();
-    command(writers.map(|writer| announces(writer.guid.prefix))).or_else(|| {
-        let participants = snapshot.participants.iter();
-        let participants = participants.filter(|_| snapshot.topics.is_empty());
-        command(participants.map(|participant| announces(participant.guid.prefix)))
-    })
+    command(writers.map(|writer| announces(writer.guid.prefix)))
+}
+
+/// Returns the command that requests the announcements of participants without a known topic.
+/// Returns `None` if it can request none of theirs.
+#[must_use]
+pub fn remedy_for_participants(participants: &[&ParticipantFacts]) -> Option<&'static str> {
+    let is_alone = |each: &ParticipantFacts| {
+        let mut others = participants.iter();
+        !others.any(|other| other.domain_id == each.domain_id && other.guid != each.guid)
+    };
+    command(participants.iter().filter_map(|each| {
+        let is_server = each.discovery_server && each.enclave.is_none();
+        // A participant that is alone has no connection that could be unseen.
+        let is_hidden = each.secured || each.announces_unseen && !is_alone(each);
+        (!is_server && !is_hidden).then(|| Announces::of_facts(each))
+    }))
 }
 
 /// Returns the command for writers as the API lists them, beside the participants.
@@ -115,6 +134,10 @@ pub fn sentence(writers: usize) -> String {
     }
 }
 
+/// Reason for participants without a known topic if no command can request their announcements.
+pub const NOTHING_TO_REQUEST: &str = "Discovery Servers have none, and encryption, or TCP between \
+    other hosts, hides those of others";
+
 /// Returns the end of a sentence about missing names: the reason and the remedy.
 #[must_use]
 pub fn explanation(remedy: &str) -> String {
@@ -123,7 +146,70 @@ pub fn explanation(remedy: &str) -> String {
 
 #[cfg(test)]
 mod tests {
+    use ros2probe_model::facts::model_time::ModelTime;
+    use ros2probe_model::report::snapshot::ProcessFacts;
+    use ros2probe_wire::{DomainId, EntityId, Guid, RtpsDuration};
+
     use super::*;
+
+    fn facts(number: u8, domain_id: u32) -> ParticipantFacts {
+        ParticipantFacts {
+            guid: Guid {
+                prefix: GuidPrefix([number; 12]),
+                entity: EntityId([0, 0, 1, 0xc1]),
+            },
+            domain_id: DomainId(domain_id),
+            vendor: VendorId::default(),
+            product_version: None,
+            enclave: Some("/".into()),
+            process: ProcessFacts::default(),
+            first_seen: ModelTime::ZERO,
+            last_seen: ModelTime::ZERO,
+            lease: RtpsDuration::Infinite,
+            secured: false,
+            announces_by_tcp: false,
+            announces_unseen: false,
+            discovery_server: false,
+            restored: false,
+            addresses: Default::default(),
+        }
+    }
+
+    /// Earlier, the command was also named where no participant could answer it.
+    #[test]
+    fn the_command_is_named_only_if_a_participant_can_answer_it() {
+        let of = |participants: &[ParticipantFacts]| {
+            let participants: Vec<_> = participants.iter().collect();
+            remedy_for_participants(&participants)
+        };
+        let server = ParticipantFacts {
+            discovery_server: true,
+            enclave: None,
+            ..facts(1, 0)
+        };
+        let secured = ParticipantFacts {
+            secured: true,
+            ..facts(2, 0)
+        };
+        let unseen = |number, domain_id| ParticipantFacts {
+            announces_by_tcp: true,
+            announces_unseen: true,
+            ..facts(number, domain_id)
+        };
+        assert_eq!(of(&[]), None);
+        assert_eq!(of(std::slice::from_ref(&server)), None);
+        assert_eq!(of(&[server.clone(), secured]), None);
+        assert_eq!(of(&[unseen(3, 0), unseen(4, 0)]), None);
+        // The connection of a participant to one that starts later may be readable.
+        assert_eq!(of(&[unseen(3, 0), unseen(4, 1)]), Some(TCP_REMEDY));
+        assert_eq!(of(&[server.clone(), facts(5, 0)]), Some(DISCOVER_COMMAND));
+        // A process with nodes may run a server, too.
+        let both = ParticipantFacts {
+            enclave: Some("/".into()),
+            ..server
+        };
+        assert_eq!(of(&[both]), Some(DISCOVER_COMMAND));
+    }
 
     #[test]
     fn the_remedy_requests_announcements_from_the_middleware_of_the_writers() {

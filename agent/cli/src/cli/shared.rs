@@ -14,7 +14,9 @@ use ros2probe_api::path::encoded;
 use ros2probe_api::problem::Code;
 use ros2probe_api::services::ServiceList;
 use ros2probe_api::topics::Topic;
-use ros2probe_daemon::missed_announcements::{DISCOVER_COMMAND, explanation, sentence};
+use ros2probe_daemon::missed_announcements::{
+    DISCOVER_COMMAND, NOTHING_TO_REQUEST, explanation, sentence,
+};
 use serde::de::DeserializeOwned;
 
 use super::{Output, UserError};
@@ -181,27 +183,33 @@ fn late_start_note(names: &Names<'_>, is_replay: bool) -> Option<String> {
         remedy,
         ..
     } = names;
-    let remedy = remedy.as_deref().unwrap_or(DISCOVER_COMMAND);
-    let what = match (names.topics.is_empty(), unknown_writers) {
-        (true, _) if *participants == 1 => {
-            let what =
-                "1 participant is known, but none of its topics: a participant that is alone";
-            return Some(if is_replay {
-                format!("{what} announces none")
-            } else {
-                format!("{what} announces them when a second one starts; `{remedy}` requests them")
-            });
-        }
-        (true, _) if *participants > 1 => {
+    let (is_nameless, remedy) = (
+        names.topics.is_empty() && *participants > 0,
+        remedy.as_deref(),
+    );
+    let is_one = *participants == 1;
+    let what = match unknown_writers {
+        _ if is_nameless && is_one => "1 participant is known, but none of its topics".to_owned(),
+        _ if is_nameless => {
             format!("{participants} participants are known, but none of their topics")
         }
-        (_, 0) => return None,
-        (_, many) => sentence(*many),
+        0 => return None,
+        many => sentence(*many),
     };
-    Some(if is_replay {
-        format!("{what}: the capture lacks their announcements")
-    } else {
-        format!("{what}: {}", explanation(remedy))
+    Some(match remedy {
+        None if is_nameless => format!("{what}: {NOTHING_TO_REQUEST}"),
+        Some(_) if is_nameless && is_one && is_replay => {
+            format!("{what}: a participant that is alone announces none")
+        }
+        Some(remedy) if is_nameless && is_one => format!(
+            "{what}: a participant that is alone announces them when a second one starts; \
+             `{remedy}` requests them"
+        ),
+        _ if is_replay => format!("{what}: the capture lacks their announcements"),
+        remedy => format!(
+            "{what}: {}",
+            explanation(remedy.unwrap_or(DISCOVER_COMMAND))
+        ),
     })
 }
 
@@ -235,5 +243,39 @@ pub(crate) fn print_or_fail(text: Option<&str>) -> Result<ExitCode> {
     match text {
         Some(text) => print_text(text),
         None => Ok(ExitCode::FAILURE),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_note_names_a_command_only_if_the_agent_names_one() {
+        let note = |participants, unknown_writers, remedy: Option<&'static str>, is_replay| {
+            let names = Names {
+                participants,
+                unknown_writers,
+                remedy: remedy.map(Into::into),
+                ..Names::default()
+            };
+            late_start_note(&names, is_replay)
+        };
+        let command = Some("some command");
+        assert_eq!(note(0, 0, None, false), None);
+        let alone = note(1, 0, command, false).unwrap();
+        assert!(alone.ends_with("when a second one starts; `some command` requests them"));
+        let many = note(3, 0, command, false).unwrap();
+        assert!(
+            many.contains("started after them; `some command`"),
+            "{many}"
+        );
+        // A Discovery Server, or participants whose announcements are hidden.
+        for (count, is_replay) in [(1, false), (3, false), (1, true)] {
+            let hidden = note(count, 0, None, is_replay).unwrap();
+            assert!(hidden.ends_with(NOTHING_TO_REQUEST), "{hidden}");
+        }
+        let writers = note(0, 2, command, true).unwrap();
+        assert!(writers.ends_with("the capture lacks their announcements"));
     }
 }

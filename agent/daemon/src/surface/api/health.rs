@@ -74,7 +74,6 @@ pub(super) fn answer(context: &Context) -> Health {
         contended_datagrams: agent.contended,
         unknown_writers: snapshot.map_or(0, |snapshot| snapshot.unknown_writers.len()),
         unknown_writers_remedy: snapshot
-            .filter(|snapshot| !snapshot.unknown_writers.is_empty())
             .and_then(|snapshot| missed_announcements::remedy(snapshot))
             .map(str::to_owned),
         topics_rejected: snapshot.map_or(0, |snapshot| snapshot.topics_rejected),

@@ -61,23 +61,31 @@ fn names(snapshot: &Snapshot, scope: Scope) -> Names<'_> {
     let is_shown =
         |domain_id, hidden: bool| scope.includes(domain_id) && (!hidden || scope.shows_hidden());
     let topics = snapshot.topics.iter().filter_map(topic);
+    let has_topics = topics
+        .clone()
+        .any(|topic| scope.includes(DomainId(topic.domain_id)));
     let mut topics: Vec<_> = topics
         .filter(|topic| is_shown(DomainId(topic.domain_id), topic.hidden))
         .collect();
     topics.sort_unstable_by(|one, other| {
         (one.domain_id, &one.name).cmp(&(other.domain_id, &other.name))
     });
+    let selected: Vec<_> = participants
+        .clone()
+        .filter(|each| scope.includes(each.domain_id))
+        .collect();
+    let remedy = missed_announcements::remedy(snapshot).or_else(|| match has_topics {
+        true => None,
+        false => missed_announcements::remedy_for_participants(&selected),
+    });
     let services = services(snapshot, scope).into_iter();
     let services =
         services.filter_map(|((domain_id, name), halves)| service(domain_id.0, name, &halves));
     Names {
         timestamp_seconds: snapshot.time().seconds(),
-        participants: participants
-            .clone()
-            .filter(|each| scope.includes(each.domain_id))
-            .count(),
+        participants: selected.len(),
         unknown_writers: snapshot.unknown_writers.len(),
-        remedy: missed_announcements::remedy(snapshot).map(Cow::Borrowed),
+        remedy: remedy.map(Cow::Borrowed),
         domains: participants.map(|each| each.domain_id.0).collect(),
         nodes: nodes
             .filter(|node| is_shown(DomainId(node.domain_id), node.hidden))
