@@ -2,7 +2,7 @@
 
 use ros2probe_model::report::snapshot::{TopicFacts, Transport};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS};
-use ros2probe_testing::model::host::{ALICE, BOB, Host, READER, WRITER};
+use ros2probe_testing::model::host::{ALICE, BOB, Host, READER, STRING, WRITER};
 use ros2probe_wire::Guid;
 
 const IMAGE: &str = "sensor_msgs::msg::dds_::Image_";
@@ -55,4 +55,47 @@ fn a_pair_of_cyclone_dds_with_shared_memory_on_two_hosts_uses_the_network() {
     // An address that other hosts cannot reach shows no host.
     let topic = image([16, 16], "127.0.0.1:7411");
     assert_eq!(topic.transports[0].transport, Transport::Iceoryx);
+}
+
+/// Announces a reader of a participant whose locators have this kind: 4 and 8 are TCP over IPv4 and
+/// IPv6. `own` are the kinds of locators that the reader itself announces.
+fn by_tcp(kind: u32, own: &[u32]) -> (Transport, bool) {
+    let locator = |kind: u32, port: u32| {
+        let address = [0xfd, 0x99, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 10, 0, 0, 2];
+        [&kind.to_le_bytes()[..], &port.to_le_bytes(), &address].concat()
+    };
+    let mut host = Host::new();
+    let tcp = locator(kind, 7411 << 16 | 5100);
+    let payload = forge::participant_with(BOB, &[(0x32, &tcp), (0x31, &tcp)]);
+    host.announce(Message::from_fast(BOB).data(forge::SPDP, 1, &payload));
+    let locators: Vec<_> = own.iter().map(|kind| locator(*kind, 7413)).collect();
+    let others: Vec<(u16, &[u8])> = locators.iter().map(|each| (0x2f, &each[..])).collect();
+    let guid = Guid::new(BOB, READER);
+    let payload = forge::endpoint_with(guid, "rt/chatter", STRING, &others);
+    host.announce(Message::from_fast(BOB).data(SEDP_READERS, 20, &payload));
+    host.wait(1000);
+    let snapshot = host.snapshot();
+    let mut participants = snapshot.participants.iter();
+    let bob = participants.find(|each| each.guid.prefix == BOB).unwrap();
+    let mut topics = snapshot.topics.iter();
+    let topic = topics.find(|topic| topic.name == "/chatter").unwrap();
+    assert_eq!(topic.transports.len(), 1, "{:?}", topic.transports);
+    (topic.transports[0].transport, bob.announces_by_tcp)
+}
+
+#[test]
+fn a_subscription_that_receives_by_tcp_has_that_passage_with_either_version_of_ip() {
+    for kind in [4, 8] {
+        assert_eq!(by_tcp(kind, &[]), (Transport::Tcp, true), "{kind}");
+        // The locators of a reader precede those of its participant.
+        assert_eq!(by_tcp(kind, &[1]), (Transport::Network, true), "{kind}");
+        // UDP is among them, so the sender need not use TCP.
+        assert_eq!(
+            by_tcp(kind, &[kind, 1]),
+            (Transport::Network, true),
+            "{kind}"
+        );
+    }
+    assert_eq!(by_tcp(1, &[]), (Transport::Network, false));
+    assert_eq!(by_tcp(1, &[8]), (Transport::Tcp, false));
 }

@@ -177,33 +177,31 @@ fn locator(kind: u32, port: u32, address: Ipv4Addr) -> Vec<u8> {
 pub fn participant_by_tcp(prefix: GuidPrefix, address: SocketAddrV4) -> Vec<u8> {
     const LOGICAL_PORT: u32 = 7411;
     let port = LOGICAL_PORT << 16 | u32::from(address.port());
-    let guid = Guid::new(prefix, EntityId::PARTICIPANT);
     let locator = locator(4, port, *address.ip());
-    encapsulated(&[
-        (0x15, vec![2, 1]),
-        (0x16, vec![1, 0x0f]),
-        (0x50, guid.to_bytes().to_vec()),
-        (0x02, [20u32.to_le_bytes(), [0; 4]].concat()),
-        (0x32, locator.clone()),
-        (0x31, locator),
-    ])
+    participant_with(prefix, &[(0x32, &locator), (0x31, &locator)])
 }
 
 /// Returns the SPDP payload of a participant of Fast DDS that announces this type of participant.
 pub fn participant_of_type(prefix: GuidPrefix, kind: &str) -> Vec<u8> {
-    let guid = Guid::new(prefix, EntityId::PARTICIPANT);
     let mut properties = 1u32.to_le_bytes().to_vec();
     for octets in [text("PARTICIPANT_TYPE"), text(kind)] {
         properties.extend(octets);
         properties.resize(properties.len().next_multiple_of(4), 0);
     }
-    encapsulated(&[
+    participant_with(prefix, &[(0x59, &properties)])
+}
+
+/// Returns the SPDP payload of a participant of Fast DDS with these further parameters.
+pub fn participant_with(prefix: GuidPrefix, others: &[(u16, &[u8])]) -> Vec<u8> {
+    let guid = Guid::new(prefix, EntityId::PARTICIPANT);
+    let mut list = vec![
         (0x15, vec![2, 3]),
         (0x16, vec![1, 0x0f]),
         (0x50, guid.to_bytes().to_vec()),
         (0x02, [20u32.to_le_bytes(), [0; 4]].concat()),
-        (0x59, properties),
-    ])
+    ];
+    list.extend(others.iter().map(|(id, value)| (*id, value.to_vec())));
+    encapsulated(&list)
 }
 
 /// Returns the SPDP payload of a participant of Fast DDS with shared memory on this machine, and with

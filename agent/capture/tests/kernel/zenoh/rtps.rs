@@ -138,6 +138,7 @@ fn compare(seen: Option<&Vec<Message>>, sent: &[&Vec<u8>], case: &str) -> Result
 }
 
 // Coverage: TCP, at the sockets | Fast DDS 2.6 | Humble | exact
+// Coverage: TCP over IPv6, at the sockets | Fast DDS 2.6 | Humble | exact
 #[test]
 fn each_message_of_a_recorded_system_is_seen_at_its_sender_and_its_receiver() -> Result<()> {
     for (capture, address) in [

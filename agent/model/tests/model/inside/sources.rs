@@ -76,6 +76,56 @@ fn a_pair_in_one_observed_process_counts_as_observed() {
     assert_eq!(topic.observed_pairs(Transport::Network), 0);
 }
 
+/// Announces a pair of two processes with this transport. The calls of the first `observed`
+/// processes are counted for ten seconds.
+fn counted_inside(transport: Transport, observed: usize) -> TopicFacts {
+    // A locator of iceoryx, or of a PSMX plugin such as `psmx_iox2`.
+    let locator = [&16u32.to_le_bytes()[..], &7411u32.to_le_bytes(), &[0; 16]].concat();
+    let (announced, from): ((u16, &[u8]), fn(GuidPrefix) -> Message) = match transport {
+        Transport::Iceoryx => ((0x2f, &locator), Message::from),
+        _ => ((0x8006, &[0; 4]), Message::from_fast),
+    };
+    let mut world = World::new();
+    let (one, other) = (world.participant(1, 70), world.participant(2, 71));
+    for (prefix, entity, announcer) in [
+        (one, EntityId([0, 1, 1, 3]), SEDP_WRITERS),
+        (other, EntityId([0, 1, 1, 4]), SEDP_READERS),
+    ] {
+        let guid = Guid::new(prefix, entity);
+        let payload = forge::endpoint_with(guid, "rt/scan", STRING, &[announced]);
+        world.put(from(prefix).data(announcer, 9, &payload));
+    }
+    for second in 1..=10 {
+        let mut reports = report(&world, 10 * second);
+        reports.push(ProcessReport {
+            subscriptions: vec![subscription("/scan", 10 * second, world.now)],
+            ..process(71)
+        });
+        reports.truncate(observed);
+        world.second(reports);
+    }
+    world.topic("/scan")
+}
+
+// Coverage: data sharing, with `capture.inside` | Fast DDS | - | counted
+// Coverage: iceoryx and PSMX, with `capture.inside` | Cyclone DDS | - | counted
+#[test]
+fn messages_in_memory_that_is_not_read_are_counted_inside_processes() {
+    for transport in [Transport::Iceoryx, Transport::DataSharing] {
+        let topic = counted_inside(transport, 0);
+        assert_eq!(topic.transports[0].transport, transport);
+        assert_eq!((topic.source, topic.rate_hz()), (Source::Wire, None));
+        let topic = counted_inside(transport, 1);
+        assert_eq!(topic.observed_pairs(transport), 0);
+        let topic = counted_inside(transport, 2);
+        assert_eq!(topic.observed_pairs(transport), 1);
+        assert_eq!(topic.source, Source::Inside);
+        assert_eq!(topic.measurement.as_ref().unwrap().messages, 100);
+        assert!((topic.rate_hz().unwrap() - 10.0).abs() < 0.01);
+        assert_eq!(topic.inside.unwrap().counts.taken, 100);
+    }
+}
+
 #[test]
 fn a_total_continues_when_the_last_remote_subscriber_leaves() {
     let (mut world, writer) = pair(70, 71);
