@@ -5,8 +5,11 @@
 
 use super::{EK_COMPLETE, EK_MINIMAL, EQUIVALENCE_HASH, MAX_COLLECTIONS};
 
+/// Length of a `NameHash`, in bytes.
+const NAME_HASH: usize = 4;
+
 /// Returns the complete TypeObject, from its size on, with zeros as padding. Returns `None` if it
-/// ends too early, or has a kind of type that a `.msg` file cannot define.
+/// ends too early, or has another kind of type.
 pub(super) fn zeroed(bytes: &[u8]) -> Option<Vec<u8>> {
     let mut object = Object {
         bytes: bytes.to_vec(),
@@ -27,7 +30,10 @@ impl Object {
         match self.u8()? {
             0x30 => self.alias(),
             0x40 => self.enumeration(),
+            0x41 => self.sized(Self::bitmask),
             0x51 => self.structure(),
+            0x52 => self.union_type(),
+            0x53 => self.sized(Self::bitset),
             _ => None,
         }
     }
@@ -53,16 +59,13 @@ impl Object {
         self.sized(|body| {
             body.u16()?;
             body.identifier(0)?;
-            body.annotations()
+            body.member_annotations()
         })
     }
 
     fn enumeration(&mut self) -> Option<()> {
         self.u16()?;
-        self.sized(|header| {
-            header.u16()?;
-            header.type_detail()
-        })?;
+        self.sized(Self::bounded_header)?;
         self.each(|literal| {
             literal.sized(|common| {
                 common.u32()?;
@@ -70,6 +73,51 @@ impl Object {
             })?;
             literal.member_detail()
         })
+    }
+
+    fn bitmask(&mut self) -> Option<()> {
+        self.u16()?;
+        self.sized(Self::bounded_header)?;
+        self.each(|flag| {
+            flag.u16()?;
+            flag.u16()?;
+            flag.member_detail()
+        })
+    }
+
+    fn bitset(&mut self) -> Option<()> {
+        self.u16()?;
+        self.sized(Self::type_detail)?;
+        self.each(|field| {
+            field.u16()?;
+            field.u16()?;
+            field.skip(2)?;
+            field.member_detail()
+        })
+    }
+
+    fn union_type(&mut self) -> Option<()> {
+        self.u16()?;
+        self.sized(Self::type_detail)?;
+        self.sized(|discriminator| {
+            discriminator.u16()?;
+            discriminator.identifier(0)?;
+            discriminator.type_annotations()
+        })?;
+        self.each(|member| {
+            member.u32()?;
+            member.u16()?;
+            member.identifier(0)?;
+            let labels = member.u32()?;
+            member.words(labels)?;
+            member.member_detail()
+        })
+    }
+
+    /// Passes the header of an enumeration or a bitmask: its size in bits, and its name.
+    fn bounded_header(&mut self) -> Option<()> {
+        self.u16()?;
+        self.type_detail()
     }
 
     /// Passes a TypeIdentifier (7.3.4.2).
@@ -104,23 +152,69 @@ impl Object {
     }
 
     fn type_detail(&mut self) -> Option<()> {
-        self.annotations()?;
+        self.type_annotations()?;
         self.string()
     }
 
     fn member_detail(&mut self) -> Option<()> {
         self.string()?;
-        self.annotations()
+        self.member_annotations()
     }
 
-    /// Passes `ann_builtin` and `ann_custom`. Padding within annotations stays as it is.
-    fn annotations(&mut self) -> Option<()> {
-        for _ in 0..2 {
-            if self.u8()? != 0 {
-                self.sized(|_| Some(()))?;
-            }
+    /// Passes the annotations of a type: `@verbatim`, and those of users.
+    fn type_annotations(&mut self) -> Option<()> {
+        self.annotations(|builtin| {
+            builtin.optional(|verbatim| {
+                verbatim.string()?;
+                verbatim.string()?;
+                verbatim.string()
+            })
+        })
+    }
+
+    /// Passes the annotations of a member: `@unit`, `@min`, `@max`, `@hashid`, and those of users.
+    fn member_annotations(&mut self) -> Option<()> {
+        self.annotations(|builtin| {
+            builtin.optional(Self::string)?;
+            builtin.optional(Self::value)?;
+            builtin.optional(Self::value)?;
+            builtin.optional(Self::string)
+        })
+    }
+
+    fn annotations(&mut self, builtin: impl FnOnce(&mut Self) -> Option<()>) -> Option<()> {
+        self.optional(|all| all.sized(builtin))?;
+        self.optional(|all| {
+            all.each(|annotation| {
+                annotation.identifier(0)?;
+                annotation.optional(|parameters| {
+                    parameters.each(|parameter| {
+                        parameter.skip(NAME_HASH)?;
+                        parameter.value()
+                    })
+                })
+            })
+        })
+    }
+
+    /// Passes an AnnotationParameterValue (7.3.4.5). Unknown kinds have a size.
+    fn value(&mut self) -> Option<()> {
+        match self.u8()? {
+            0x01 | 0x02 | 0x0c | 0x0d | 0x10 => self.skip(1),
+            0x03 | 0x06 | 0x11 => self.u16(),
+            0x04 | 0x07 | 0x09 | 0x40 => self.words(1),
+            0x05 | 0x08 | 0x0a => self.words(2),
+            0x0b => self.words(4),
+            0x20 | 0x21 => self.string(),
+            _ => self.sized(|_| Some(())),
         }
-        Some(())
+    }
+
+    fn optional(&mut self, content: impl FnOnce(&mut Self) -> Option<()>) -> Option<()> {
+        match self.u8()? {
+            0 => Some(()),
+            _ => content(self),
+        }
     }
 
     fn string(&mut self) -> Option<()> {
@@ -169,6 +263,14 @@ impl Object {
         let number = *self.bytes.get(self.position..)?.first_chunk::<4>()?;
         self.position += number.len();
         usize::try_from(u32::from_le_bytes(number)).ok()
+    }
+
+    /// Passes numbers of four bytes.
+    fn words(&mut self, count: usize) -> Option<()> {
+        for _ in 0..count {
+            self.u32()?;
+        }
+        Some(())
     }
 
     fn skip(&mut self, count: usize) -> Option<()> {

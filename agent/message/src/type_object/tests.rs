@@ -190,6 +190,7 @@ const THING_PADDING: [usize; 14] = [
 ];
 const TICKS_PADDING: [usize; 7] = [0x5e, 0x5f, 0x85, 0x86, 0x87, 0x92, 0x93];
 const MODE_PADDING: [usize; 5] = [0x9a, 0x9b, 0xa7, 0xb6, 0xb7];
+const CHOICE_PADDING: [usize; 8] = [0x5e, 0x5f, 0x86, 0x87, 0x91, 0x92, 0x93, 0xa7];
 
 /// Returns the reply as Fast DDS 3 would send it, with bytes of an earlier message as padding.
 fn with_undefined_padding(reply: &[u8], padding: &[usize]) -> Vec<u8> {
@@ -206,6 +207,7 @@ fn objects_with_undefined_padding_have_their_hash() {
         (THING, &THING_PADDING[..]),
         (TICKS, &TICKS_PADDING),
         (MODE, &MODE_PADDING),
+        (CHOICE, &CHOICE_PADDING),
     ] {
         assert!(padding.iter().all(|position| reply[*position] == 0));
         let changed = with_undefined_padding(reply, padding);
@@ -222,6 +224,149 @@ fn objects_with_undefined_padding_have_their_hash() {
     let found = library.find(THING_NAME, Some(THING_HASH)).unwrap();
     assert!(found.structures().eq(thing().structures()));
     assert_eq!(library.described_figures().objects_refused, 0);
+}
+
+/// Checks that a TypeObject with undefined padding has the hash of the one with zeros, and returns
+/// the latter.
+fn without_padding(write: impl Fn(&mut Writer)) -> Vec<u8> {
+    let [zeros, undefined] = [0, 0xa5].map(|padding| {
+        let mut writer = Writer(Vec::new(), padding);
+        writer.sized(&write);
+        writer.0
+    });
+    assert_ne!(zeros, undefined);
+    let found = with_hash(&undefined, hash(&zeros));
+    assert_eq!(found.as_deref(), Some(&zeros[..]));
+    for length in 0..undefined.len() {
+        assert_eq!(with_hash(&undefined[..length], hash(&zeros)), None);
+    }
+    zeros
+}
+
+#[test]
+fn annotations_with_undefined_padding_do_not_hide_a_type() {
+    let object = without_padding(|writer| {
+        writer.0.extend([0xf2, 0x51]);
+        writer.u16(1);
+        writer.sized(|header| {
+            // No base type, `@verbatim`, and an annotation of the user with values of all sizes.
+            header.0.extend([0, 1]);
+            header.sized(|builtin| {
+                builtin.0.push(1);
+                for text in ["BEFORE_DECLARATION", "comment", "A speed."] {
+                    builtin.string(text);
+                }
+            });
+            header.0.push(1);
+            header.sized(|all| {
+                all.u32(1);
+                all.sized(|annotation| {
+                    annotation.identifier(&Id::Hash(EquivalenceHash([9; 14])));
+                    annotation.0.push(1);
+                    annotation.sized(values);
+                });
+            });
+            header.string("a::msg::dds_::B_");
+        });
+        writer.sized(|all| {
+            all.u32(1);
+            all.sized(|member| {
+                member.u32(0);
+                member.u16(1);
+                member.identifier(&Id::Kind(0x0a));
+                member.string("x");
+                member.0.push(1);
+                member.sized(|builtin| {
+                    builtin.0.push(1);
+                    builtin.string("m/s");
+                    for number in [0, 7] {
+                        builtin.0.extend([1, 0x04]);
+                        builtin.u32(number);
+                    }
+                    builtin.0.push(0);
+                });
+                member.0.push(0);
+            });
+        });
+    });
+    let found = assembled(&[&reply(&[object])]).unwrap();
+    assert_eq!(fields(&found), "float64 x\n");
+}
+
+/// Writes a parameter of an annotation with a value of each size, and one of an unknown kind.
+fn values(parameters: &mut Writer) {
+    const KINDS: [u8; 7] = [0x01, 0x03, 0x40, 0x08, 0x0b, 0x20, 0xee];
+    parameters.u32(KINDS.len() as u32);
+    for kind in KINDS {
+        parameters.sized(|parameter| {
+            parameter.0.extend([1, 2, 3, 4, kind]);
+            match kind {
+                0x01 => parameter.0.push(1),
+                0x03 => parameter.u16(5),
+                0x20 => parameter.string("text"),
+                0xee => parameter.sized(|extended| extended.0.push(3)),
+                _ => {
+                    let words = match kind {
+                        0x40 => 1,
+                        0x08 => 2,
+                        _ => 4,
+                    };
+                    for number in 0..words {
+                        parameter.u32(number);
+                    }
+                }
+            }
+        });
+    }
+}
+
+#[test]
+fn bits_with_undefined_padding_are_refused_by_name() {
+    let refused = |object: &[u8]| TypeObject::parse(object).unwrap_err().to_string();
+    let mask = without_padding(|writer| {
+        writer.0.extend([0xf2, 0x41]);
+        writer.sized(|mask| {
+            mask.u16(0);
+            mask.sized(|header| {
+                header.u16(8);
+                header.0.extend([0, 0]);
+                header.string("a::msg::dds_::M_");
+            });
+            mask.sized(|all| {
+                all.u32(2);
+                for position in 0..2 {
+                    all.sized(|flag| {
+                        flag.u16(position);
+                        flag.u16(0);
+                        flag.string("flag");
+                        flag.0.extend([0, 0]);
+                    });
+                }
+            });
+        });
+    });
+    assert_eq!(refused(&mask), "a bitmask is not supported");
+    let set = without_padding(|writer| {
+        writer.0.extend([0xf2, 0x53]);
+        writer.sized(|set| {
+            set.u16(0);
+            set.sized(|header| {
+                header.0.extend([0, 0]);
+                header.string("a::msg::dds_::S_");
+            });
+            set.sized(|all| {
+                all.u32(1);
+                all.sized(|field| {
+                    field.u16(0);
+                    field.u16(0);
+                    field.0.extend([3, 0x02]);
+                    field.string("field");
+                    field.0.extend([0, 0]);
+                });
+            });
+        });
+    });
+    assert_eq!(refused(&set), "a bitset is not supported");
 }
 
 #[test]
@@ -427,13 +572,14 @@ enum Id {
     Array(Vec<u8>),
 }
 
-/// Writes XCDR2 in little-endian order.
+/// Writes XCDR2 in little-endian order, with this byte as padding.
 #[derive(Default)]
-struct Writer(Vec<u8>);
+struct Writer(Vec<u8>, u8);
 
 impl Writer {
     fn align(&mut self, alignment: usize) {
-        self.0.resize(self.0.len().next_multiple_of(alignment), 0);
+        let length = self.0.len().next_multiple_of(alignment);
+        self.0.resize(length, self.1);
     }
 
     fn u16(&mut self, number: u16) {
@@ -534,7 +680,7 @@ fn hash(object: &[u8]) -> EquivalenceHash {
 
 /// Returns a reply with these TypeObjects.
 fn reply(objects: &[Vec<u8>]) -> Vec<u8> {
-    let mut writer = Writer(vec![0, 7, 0, 0]);
+    let mut writer = Writer(vec![0, 7, 0, 0], 0);
     writer.0.extend([7; REQUEST_IDENTITY]);
     writer.u32(0);
     writer.sized(|writer| {
