@@ -19,7 +19,7 @@ pub struct Names<'a> {
     /// Number of active writers whose announcement was missed. Their domain is unknown.
     pub unknown_writers: usize,
     /// Command that requests the announcements of unknown writers, or of participants without a
-    /// known topic; null without such writers and participants, and if no participant can answer.
+    /// known topic. Null without such writers and participants, and if none can answer.
     pub remedy: Option<Cow<'a, str>>,
     /// Nodes, sorted by domain and name.
     pub nodes: Vec<NodeName<'a>>,
