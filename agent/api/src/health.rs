@@ -84,6 +84,8 @@ pub struct Health {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub zenoh: Option<Zenoh>,
+    /// Address of the page on the agent's host; null if the page is not served.
+    pub page: Option<String>,
     /// Process id of the agent, in its own PID namespace.
     pub process_id: u32,
     /// Seconds since the agent's process started; null if unknown.

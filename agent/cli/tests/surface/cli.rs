@@ -349,7 +349,7 @@ fn rp_without_a_command_prints_what_to_do_next_and_all_commands() {
         "{text}"
     );
     assert!(lines.all(|line| line.starts_with("  ")), "{text}");
-    assert!(steps.lines().count() <= 4, "{text}");
+    assert!(steps.lines().count() <= 6, "{text}");
     assert!(
         commands.contains("Usage: rp") && commands.contains("  ci "),
         "{text}"

@@ -243,7 +243,11 @@ fn the_page_can_be_switched_off() {
             "{path}"
         );
     }
-    assert_eq!(get(&agent, "/health")["ready"], true);
+    let health = get(&agent, "/health");
+    assert_eq!(
+        (&health["ready"], &health["page"]),
+        (&Value::Bool(true), &Value::Null)
+    );
     let (status, token) = call_api(agent.api, "POST", "/page/token", "");
     assert_eq!((status, &token["address"]), (200, &Value::Null));
 }
@@ -282,6 +286,7 @@ fn a_token_from_the_socket_grants_the_page_more_access_than_loopback() {
     assert!(printed.status.success(), "{output_text}");
     let (page, token) = address.trim().split_once("#token=").unwrap();
     assert_eq!(page, format!("http://localhost:{}/", agent.api.port()));
+    assert_eq!(get(&agent, "/health")["page"], page);
     let bearer = format!("Authorization: Bearer {token}\r\n");
     assert_eq!(
         request(agent.api, "GET", "/recordings", &bearer).status,

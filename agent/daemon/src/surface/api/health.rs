@@ -118,6 +118,7 @@ pub(super) fn answer(context: &Context) -> Health {
         foxglove: foxglove(&context.viewers),
         ros2_daemon: ros2_daemon(&context.ros2_daemon),
         zenoh: snapshot.and_then(|snapshot| snapshot.zenoh.as_ref().map(zenoh)),
+        page: context.page.address(),
         process_id: std::process::id(),
         uptime_seconds: started.map(|started| (now.as_secs_f64() - started).max(0.0)),
     }

@@ -101,7 +101,7 @@ impl Page {
     }
 
     /// Returns the address of the page on the agent's host; `None` if the page is not served.
-    fn address(&self) -> Option<String> {
+    pub(super) fn address(&self) -> Option<String> {
         let is_near = |address: &&SocketAddr| address.ip().is_loopback();
         let near = self.addresses.iter().find(is_near);
         let address = near.or_else(|| self.addresses.first())?;
