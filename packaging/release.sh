@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Makes what a maintainer publishes, in target/publish. The files of `make dist` come first. The
-# others are wheels, sources of the packages for ROS, an image, a Helm chart, crates and a repository
-# for apt. Notes, provenance, checksums and signatures describe them.
+# others are wheels, sources of the packages for ROS, an archive of manifests and the Ansible role, an
+# image, a Helm chart, crates and a repository for apt. Notes, provenance, checksums and signatures describe them.
 #
 #   packaging/release.sh             sign with the keys of the maintainers
 #   packaging/release.sh --trial     sign with keys that are deleted afterwards
@@ -97,6 +97,9 @@ release() {
 
     step "packages for ROS"
     packaging/ros.sh "$out"
+
+    step "manifests, Ansible role and compose file"
+    packaging/deploy.sh "$out"
 
     step "OCI image"
     packaging/image.py "$out/ros2probe-$version-image.tar" "$commit" "${packages[@]}"

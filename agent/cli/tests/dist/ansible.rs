@@ -18,17 +18,16 @@ use crate::package::installation::{all, installable};
 
 const CONFIG: &str = "/etc/ros2probe/ros2probe.yaml";
 
-/// A host to which Ansible applies the role.
-pub(crate) struct Managed {
-    pub(crate) host: Debian,
+/// Ansible with an inventory of one host.
+pub(crate) struct Ansible {
+    playbook: PathBuf,
     inventory: PathBuf,
     directory: PathBuf,
 }
 
-impl Managed {
-    /// Starts a host with systemd whose `/packages` is `directory`.
-    pub(crate) fn start(directory: &Path) -> Result<Self> {
-        let host = Debian::start(Start::Systemd, directory)?;
+impl Ansible {
+    /// Writes the inventory into a directory.
+    pub(crate) fn over(host: &Debian, directory: &Path, playbook: PathBuf) -> Result<Self> {
         let enter = directory.join("enter");
         // Ansible's last argument is the command for the host's shell.
         let script = format!(
@@ -43,12 +42,12 @@ impl Managed {
             &inventory,
             format!(
                 "robot ansible_ssh_executable={} ansible_ssh_args='' ansible_ssh_transfer_method=piped \
-                 ansible_python_interpreter=/usr/bin/python3\n",
+                 ansible_python_interpreter=/usr/bin/python3 ansible_remote_tmp=/tmp/ansible\n",
                 enter.display()
             ),
         )?;
         Ok(Self {
-            host,
+            playbook,
             inventory,
             directory: directory.to_owned(),
         })
@@ -59,12 +58,32 @@ impl Managed {
         let mut playbook = Command::new("ansible-playbook");
         playbook.arg("--inventory").arg(&self.inventory);
         playbook.arg("--extra-vars").arg(variables.to_string());
-        playbook.arg(repository("deploy/ansible/site.yaml"));
+        playbook.arg(&self.playbook);
         playbook.envs([("ANSIBLE_PIPELINING", "1"), ("ANSIBLE_NOCOLOR", "1")]);
         playbook.env("ANSIBLE_HOME", self.directory.join("ansible"));
         playbook.env("ANSIBLE_LOCAL_TEMP", self.directory.join("ansible/tmp"));
         let output = playbook.output();
         output.context("ansible-playbook; `apt-get install ansible-core`")
+    }
+}
+
+/// A host to which Ansible applies the role.
+pub(crate) struct Managed {
+    pub(crate) host: Debian,
+    ansible: Ansible,
+}
+
+impl Managed {
+    /// Starts a host with systemd whose `/packages` is `directory`.
+    pub(crate) fn start(directory: &Path) -> Result<Self> {
+        let host = Debian::start(Start::Systemd, directory)?;
+        let ansible = Ansible::over(&host, directory, repository("deploy/ansible/site.yaml"))?;
+        Ok(Self { host, ansible })
+    }
+
+    /// Applies the role with these variables.
+    fn apply(&self, variables: &Value) -> Result<Output> {
+        self.ansible.apply(variables)
     }
 
     /// Applies the role, which must succeed, and returns whether it changed the host.
@@ -134,6 +153,22 @@ fn the_role_installs_configures_and_reloads_the_agent() -> Result<()> {
 
     robot.changed(&with(&variables, "ros2probe_enabled", json!(false)))?;
     ensure!(active()?.trim() == "inactive", "{}", active()?);
+
+    // The user of the host stays, outside the group that is gone.
+    let absent = json!({"ros2probe_state": "absent"});
+    ensure!(robot.changed(&absent)?, "nothing was removed");
+    host.run(
+        "for path in /usr/bin/rp /etc/ros2probe /var/lib/ros2probe /var/cache/ros2probe_*; do \
+         ! test -e $path || exit 1; done; \
+         ! getent passwd ros2probe && ! getent group ros2probe && id pilot",
+    )?;
+    ensure!(!robot.changed(&absent)?, "a second run changed the host");
+    let misspelled = robot.apply(&json!({"ros2probe_state": "gone"}))?;
+    ensure!(
+        !misspelled.status.success() && all(&misspelled).contains("to present or absent"),
+        "{}",
+        all(&misspelled)
+    );
     Ok(())
 }
 

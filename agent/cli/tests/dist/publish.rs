@@ -3,6 +3,7 @@
 
 mod containers;
 mod crates;
+mod deploy;
 mod feed;
 mod image;
 pub mod podman;

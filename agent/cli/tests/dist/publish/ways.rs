@@ -17,11 +17,13 @@ use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::harness::peer::robot;
 use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::wait_within;
+use serde_json::json;
 
 use super::containers::{seccomp, start_in_container};
 use super::podman::{Options, Podman};
 use super::repository::{ADDRESS, listen, serve};
-use super::{VERSION, package, published, succeed, tool};
+use super::{VERSION, all, deploy, package, published, succeed, tool};
+use crate::ansible::Ansible;
 use crate::package::installation::debian::{Debian, Start};
 
 /// Maximum time from the start of an agent to the first metric.
@@ -201,6 +203,35 @@ fn the_repository_for_apt() -> Result<()> {
     fresh.measures("repository for apt", "/by_repository", began)?;
     host.run(PURGE)?;
     host.run("rm /etc/apt/keyrings/ros2probe.asc /etc/apt/sources.list.d/ros2probe.list")?;
+    fresh.check_unchanged()
+}
+
+#[test]
+#[ignore = "looks at a release: make release"]
+fn the_role_measures_and_removes_everything() -> Result<()> {
+    let directory = tempfile::tempdir()?;
+    let playbook = deploy::released(directory.path())?.join("deploy/ansible/site.yaml");
+    let fresh = FreshDebian::start(Start::Systemd, &[])?;
+    let ansible = Ansible::over(&fresh.host, directory.path(), playbook)?;
+    let key = published()?.join("apt/ros2probe.asc");
+    let apply = |state: &str| -> Result<()> {
+        let output = ansible.apply(&json!({
+            "ros2probe_repository": ADDRESS,
+            "ros2probe_repository_key": key,
+            "ros2probe_state": state,
+        }))?;
+        ensure!(
+            output.status.success(),
+            "{state}: {}{}",
+            all(&output),
+            fresh.log()
+        );
+        Ok(())
+    };
+    let began = Instant::now();
+    apply("present")?;
+    fresh.measures("Ansible role", "/by_role", began)?;
+    apply("absent")?;
     fresh.check_unchanged()
 }
 
