@@ -6,6 +6,8 @@
 #   packaging/release.sh             sign with the keys of the maintainers
 #   packaging/release.sh --trial     sign with keys that are deleted afterwards
 #   packaging/release.sh --keys      check that the keys exist, and make nothing
+#   packaging/release.sh --again     make all files but the signed ones a second time, in a copy of the
+#                                    sources in another directory, and compare the checksums
 #
 # MINISIGN_SECRET_KEY and APT_SIGNING_KEY name the files of the secret keys. MINISIGN_PASSWORD and
 # APT_SIGNING_PASSPHRASE unlock them; without MINISIGN_PASSWORD, minisign prompts for it.
@@ -28,6 +30,7 @@ umask 022
 target=$(realpath -m "${CARGO_TARGET_DIR:-target}")
 dist=$target/dist out=$target/publish
 version=$(sed -n '/^\[workspace.package\]/,/^\[/s/^version = "\(.*\)"/\1/p' Cargo.toml)
+packages=("$dist/ros2probe_${version}"_{amd64,arm64}.deb)
 trial=
 private=$(mktemp -d)
 trap 'rm -rf "$private"' EXIT
@@ -84,8 +87,9 @@ sources() {
         die "the sources have changes that are not committed: the provenance would name the wrong commit"
 }
 
-release() {
-    local package packages=("$dist/ros2probe_${version}"_{amd64,arm64}.deb)
+# Makes all files that need no key.
+files() {
+    local package
     sources
     rm -rf "$out"
     mkdir -p "$out"
@@ -110,7 +114,7 @@ release() {
 
     step "crates, each built from its packed files"
     rm -rf "$target/crates/package"
-    cargo package --workspace --exclude ros2probe-testing --locked ${trial:+--allow-dirty} \
+    cargo package --workspace --exclude ros2probe-testing --locked ${trial:+--allow-dirty} "$@" \
         --target-dir "$target/crates" >&2
     cp "$target"/crates/package/*.crate "$out"
 
@@ -121,9 +125,29 @@ release() {
     packaging/provenance.py "$commit" "$out" >"$private/provenance"
     install -m 644 "$private/provenance" "$out/ros2probe-$version.provenance.json"
 
-    step "checksums, signed by minisign"
+    step "checksums"
     (cd "$out" && find . -type f -printf '%P\0' | sort -z | xargs -0 sha256sum) >"$private/sums"
     install -m 644 "$private/sums" "$out/SHA256SUMS"
+}
+
+# Makes the files of the same target/dist in a copy of the sources. Its crates are not built again.
+again() {
+    local there=$private/elsewhere/with-another-name
+    [ -f "$out/SHA256SUMS" ] || die "$out has no release: run make release"
+    git clone --quiet --no-checkout "$root" "$there"
+    git -C "$there" reset --quiet
+    # With the changes of a trial.
+    git ls-files -z --cached --others --exclude-standard | tar -c --null --files-from=- | tar -x -C "$there"
+    mkdir "$there/target"
+    cp -a "$dist" "$there/target"
+    env -u CARGO_TARGET_DIR "$there/packaging/release.sh" --unsigned
+    step "comparing both releases"
+    diff "$out/SHA256SUMS" "$there/target/publish/SHA256SUMS" >&2 || die "the two releases differ"
+}
+
+release() {
+    files
+    step "signature of the checksums, by minisign"
     sign
 
     step "repository for apt, signed by gpg"
@@ -149,5 +173,10 @@ case ${1-} in
     release
     ;;
 --keys) keys ;;
-*) die "usage: packaging/release.sh [--trial|--keys]" ;;
+--again) again ;;
+--unsigned)
+    trial=yes
+    files --no-verify
+    ;;
+*) die "usage: packaging/release.sh [--trial|--keys|--again]" ;;
 esac; exit

@@ -58,6 +58,12 @@ fn a_release_without_keys_is_refused_with_the_variable_to_set() -> Result<()> {
 
 #[test]
 #[ignore = "looks at a release: make release"]
+fn a_release_of_a_copy_in_another_directory_has_the_same_checksums() -> Result<()> {
+    succeed(packaging("release.sh")?.arg("--again")).map(drop)
+}
+
+#[test]
+#[ignore = "looks at a release: make release"]
 fn minisign_verifies_the_checksums_of_all_files_and_no_others() -> Result<()> {
     let directory = published()?;
     let verify = |sums: &Path| {
