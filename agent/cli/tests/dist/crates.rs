@@ -12,16 +12,24 @@ use serde_json::Value;
 
 use super::package::installation::succeed;
 
-/// Returns name and directory of each crate of the workspace that is published.
-pub(crate) fn published() -> Result<Vec<(String, PathBuf)>> {
+/// Returns what cargo knows of each crate of the workspace that is published.
+fn members() -> Result<Vec<Value>> {
     let mut metadata = cargo("metadata");
     let text = succeed(metadata.args(["--no-deps", "--format-version=1"]))?;
     let metadata: Value = serde_json::from_str(&text)?;
     let packages = metadata["packages"].as_array().context("no packages")?;
-    let text = |value: &Value| value.as_str().unwrap_or_default().to_owned();
-    packages
+    let is_published = |package: &&Value| package["publish"] != Value::Array(Vec::new());
+    Ok(packages.iter().filter(is_published).cloned().collect())
+}
+
+fn text(value: &Value) -> String {
+    value.as_str().unwrap_or_default().to_owned()
+}
+
+/// Returns name and directory of each crate of the workspace that is published.
+pub(crate) fn published() -> Result<Vec<(String, PathBuf)>> {
+    members()?
         .iter()
-        .filter(|package| package["publish"] != Value::Array(Vec::new()))
         .map(|package| {
             let manifest = PathBuf::from(text(&package["manifest_path"]));
             let directory = manifest.parent().context("no directory")?;
@@ -102,5 +110,41 @@ fn every_source_file_of_rp_is_in_a_published_crate() -> Result<()> {
         absent.is_empty(),
         "no packed crate contains {absent:?}: move it into the crate, or link it there"
     );
+    Ok(())
+}
+
+/// Earlier, the page lacked a crate.
+#[test]
+fn the_page_lists_each_published_crate_behind_those_that_it_needs() -> Result<()> {
+    let page = fs::read_to_string(sources("docs/release.md"))?;
+    let (_, list) = page
+        .split_once("in the order of their dependencies:")
+        .context("no list")?;
+    let (list, _) = list.split_once("\n\n").context("no end")?;
+    let listed: Vec<String> = list
+        .split('`')
+        .skip(1)
+        .step_by(2)
+        .filter(|name| !name.contains(' ') && !name.starts_with("--"))
+        .map(|name| match name.strip_prefix('-') {
+            Some(part) => format!("ros2probe-{part}"),
+            None => name.to_owned(),
+        })
+        .collect();
+    let place = |name: &str| listed.iter().position(|listed| listed == name);
+    let members = members()?;
+    for member in &members {
+        let name = text(&member["name"]);
+        let own = place(&name).with_context(|| format!("{name} is not listed"))?;
+        let needed = member["dependencies"].as_array().context("no list")?;
+        for dependency in needed.iter().filter(|each| each["kind"] != "dev") {
+            let needed = text(&dependency["name"]);
+            ensure!(
+                place(&needed).is_none_or(|before| before < own),
+                "{needed} is behind {name}"
+            );
+        }
+    }
+    ensure!(listed.len() == members.len(), "{listed:?}");
     Ok(())
 }
