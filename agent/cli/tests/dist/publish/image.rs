@@ -15,7 +15,7 @@ use super::podman::{Options, Podman};
 use super::{VERSION, image, measures_on_arm, on_arm, package, packaging, succeed};
 
 /// Maximum size of the image of one architecture, as registries transfer it.
-const MAX_BYTES: u64 = 30 * 1024 * 1024;
+const MAX_BYTES: u64 = 30_000_000;
 const PROGRAM: &str = "usr/bin/rp";
 const USER: u32 = 65532;
 
