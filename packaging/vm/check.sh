@@ -276,6 +276,21 @@ stop_peers() {
     wait $publisher $subscriber
 }
 
+# From the first command of the installation to the first metric of a robot, which starts when the
+# agent is ready.
+first_metric() {
+    ./robot --role sub --topic /first --size 320 --best-effort >first_sub.log 2>&1 &
+    subscriber=$!
+    ./robot --role pub --topic /first --size 320 --rate 50 --best-effort >first_pub.log 2>&1 &
+    publisher=$!
+    is_counted() { [ "$(sum ros2_topic_messages_total 'topic="/first"')" -gt 0 ]; }
+    wait_until 120 is_counted
+    status=$?
+    figure=$(awk -v began="$install_began" '{ printf "%.0f s from the first command", $1 - began }' /proc/uptime)
+    stop_peers
+    return $status
+}
+
 restarted() {
     # A publisher that announced itself long ago: only the state has its name.
     ./robot --role pub --topic /kept --size 64 --rate 20 --best-effort >kept.log 2>&1 &
@@ -322,6 +337,7 @@ late_causes() {
     why=$(curl -s --max-time 5 'http://127.0.0.1:17401/why?above_ms=15')
     exec 3>&-
     wait $traced
+    rm -r /home/rover
     figure=$(echo "$why" | jq -r '[.causes[] | "\(.late_calls) \(.cause)"] | join(", ")')
     reason=$(echo "$why" | jq -r '.reason // empty')
     figure="$figure${reason:+: $reason}"
@@ -395,11 +411,26 @@ zenoh_observed() {
     figure=$(journalctl -u ros2probe --no-pager -o cat | grep 'Zenoh are not observed' | head -1)
     [ -z "$figure" ]
 }
+# Each path with type, mode, owner and target, and the checksum of each file in /etc. Left out are file
+# systems in memory, files of these checks, logs, caches of apt, locks and backups of dpkg, and what
+# systemd writes while it runs.
+paths() {
+    {
+        find / -xdev \( -path /proc -o -path /sys -o -path /dev -o -path /run -o -path /tmp -o -path "$here" \
+            -o -path /var/tmp -o -path /var/log -o -path /var/cache/apt -o -path /var/lib/apt \
+            -o -path '/var/lib/systemd/[!d]*' -o -path /var/lib/private -o -path '/var/lib/dpkg/*-old' \
+            -o -path '/var/lib/dpkg/*lock*' -o -path '/etc/*-' \) -prune -o -printf '%p %y %m %U:%G %l\n'
+        find /etc -type f ! -name '*-' -exec sha256sum {} +
+    } | LC_ALL=C sort
+}
+# The removal that docs/install.md describes leaves the paths of before the installation.
 purged() {
-    apt-get purge -y ros2probe >purge.log 2>&1
-    figure=$(find /etc/ros2probe /var/lib/ros2probe /usr/bin/rp /lib/systemd/system/ros2probe.service 2>/dev/null | wc -l)
-    figure="$figure files left"
-    [ "${figure%% *}" = 0 ]
+    apt-get purge -y ros2probe >purge.log 2>&1 && deluser --system ros2probe >>purge.log 2>&1
+    status=$?
+    paths >paths.after
+    LC_ALL=C comm -13 paths.before paths.after >left.txt
+    figure="$(wc -l <left.txt) paths left or changed $(cut -d ' ' -f 1-3 left.txt | head -3 | paste -sd ' ' -)"
+    [ $status = 0 ] && ! [ -s left.txt ]
 }
 
 # CPU of the agent and of a subscriber in C++ beside it, for the same messages.
@@ -446,12 +477,14 @@ there=
 [ -z "${HIDE_BTF-}" ] || mount -t tmpfs none /sys/kernel/btf
 within lo
 describe
+paths >paths.before
 check "a changed repository is refused" tampering_refused
 check install installed
 if ! is_ready; then
     journalctl -u ros2probe --no-pager -o cat | tail -30 | sed 's/^/LOG\t/'
     exit 1
 fi
+[ "$source" != host ] || check "first metric" first_metric
 check active active
 check "source" source_of "$source"
 check threads confined

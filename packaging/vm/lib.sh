@@ -45,6 +45,7 @@ apt_from() {
 }
 # Installs as docs/install.md does, from the repository of the release.
 installed() {
+    install_began=$(cut -d ' ' -f 1 /proc/uptime)
     apt_from apt update >install.log 2>&1 && apt_from apt install -y ros2probe >>install.log 2>&1 &&
         wait_until 60 is_ready
     status=$?
