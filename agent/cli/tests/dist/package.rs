@@ -62,6 +62,7 @@ fn a_host_with_systemd_runs_the_agent_until_the_package_is_purged() -> Result<()
     only_the_drop_in_for_interfaces_permits_the_wire_source(&host, &old)?;
     a_service_without_any_source_ends_with_the_missing_lines(&host)?;
     the_socket_admits_the_group_only(&host)?;
+    doctor_applies_only_the_remedy_that_the_user_accepts(&host)?;
     an_upgrade_keeps_the_operators_configuration(&host, &upgrade)?;
     check_disabled_service(&host, &old, &upgrade)?;
     a_wrong_configuration_fails_the_service_only(&host, &upgrade)?;
@@ -203,6 +204,51 @@ fn the_socket_admits_the_group_only(host: &Debian) -> Result<()> {
         "{}",
         all(&list("stranger")?)
     );
+    Ok(())
+}
+
+/// Runs `rp doctor --fix` on a terminal as sudo does for the user `stranger`. Accepts the membership
+/// of the group alone, and prints the terminal.
+const ACCEPT_MEMBERSHIP: &str = r#"
+import os, pty, sys
+child, terminal = pty.fork()
+if child == 0:
+    os.environ["SUDO_USER"] = "stranger"
+    os.execvp("rp", ["rp", "doctor", "--fix"])
+text = ""
+while True:
+    try:
+        part = os.read(terminal, 4096)
+    except OSError:
+        break
+    if not part:
+        break
+    text += part.decode(errors="replace")
+    if text.endswith("Apply it? [y/N] "):
+        offer = text.rsplit("\r\n\r\n", 1)[-1]
+        is_membership = "usermod -aG ros2probe stranger" in offer
+        os.write(terminal, b"y\n" if is_membership else b"n\n")
+print(text.replace("\r", ""))
+sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"#;
+
+/// Checks that each remedy is shown before the question, and that the accepted one works at once.
+fn doctor_applies_only_the_remedy_that_the_user_accepts(host: &Debian) -> Result<()> {
+    let printed = host.run(&format!("python3 - <<'END'{ACCEPT_MEMBERSHIP}END"))?;
+    let accepted = "  usermod -aG ros2probe stranger\n  stranger has to log in again\n\
+                    Apply it? [y/N] y\n  done\n";
+    ensure!(printed.contains(accepted), "{printed}");
+    let questions = printed.matches("Apply it?").count();
+    let skipped = printed.matches("n\n  skipped\n").count();
+    ensure!(questions == skipped + 1, "{printed}");
+    host.run(
+        "! test -e /etc/sysctl.d/90-ros2probe.conf && \
+         ! test -e /etc/systemd/system/ros2probe.service.d && \
+         setpriv --reuid stranger --regid stranger --init-groups rp topic list",
+    )?;
+    // The membership is offered once.
+    let offered = host.run(&format!("python3 - <<'END'{ACCEPT_MEMBERSHIP}END"))?;
+    ensure!(!offered.contains("usermod"), "{offered}");
     Ok(())
 }
 
