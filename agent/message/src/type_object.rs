@@ -134,6 +134,9 @@ pub(crate) fn without_request(payload: &[u8]) -> &[u8] {
     payload.get(header + REQUEST_IDENTITY..).unwrap_or(payload)
 }
 
+/// The bytes of a complete type, and their hash.
+pub(crate) type HashedObject<'a> = (EquivalenceHash, Cow<'a, [u8]>);
+
 /// Returns the hashes and the bytes of the complete types in a reply. The payload begins with its
 /// encapsulation header. A reply to another request, or with a failure, has none.
 ///
@@ -142,7 +145,7 @@ pub(crate) fn without_request(payload: &[u8]) -> &[u8] {
 ///
 /// # Errors
 /// Fails if the payload is not a reply, or if no object has its hash.
-pub(crate) fn objects(payload: &[u8]) -> Result<Vec<(EquivalenceHash, Cow<'_, [u8]>)>, NotUsable> {
+pub(crate) fn objects(payload: &[u8]) -> Result<Vec<HashedObject<'_>>, NotUsable> {
     if payload.len() > MAX_REPLY {
         return Err(NotUsable::TooLong);
     }
