@@ -74,7 +74,7 @@ pub(super) fn answer(context: &Context) -> Health {
         contended_datagrams: agent.contended,
         unknown_writers: snapshot.map_or(0, |snapshot| snapshot.unknown_writers.len()),
         unknown_writers_remedy: snapshot
-            .and_then(|snapshot| missed_announcements::remedy(snapshot))
+            .and_then(missed_announcements::remedy)
             .map(str::to_owned),
         topics_rejected: snapshot.map_or(0, |snapshot| snapshot.topics_rejected),
         source_reason: agent.source_reason.clone(),
