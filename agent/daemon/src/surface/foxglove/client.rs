@@ -205,13 +205,13 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
                     }
                 }
                 item = next(&mut self.messages) => {
-                    let mut item = item;
-                    for _ in 0..MAX_BATCH {
-                        self.send_item(item).await?;
-                        match self.messages.as_mut().and_then(Subscription::try_next) {
-                            Some(next) => item = Some(next),
-                            None => break,
+                    self.send_item(item).await?;
+                    for _ in 1..MAX_BATCH {
+                        let next = self.messages.as_mut().and_then(Subscription::try_next);
+                        if next.is_none() {
+                            break;
                         }
+                        self.send_item(next).await?;
                     }
                 }
             }

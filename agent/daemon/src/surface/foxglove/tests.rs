@@ -306,6 +306,23 @@ async fn a_viewer_that_does_not_read_loses_the_oldest_messages_and_their_number_
 }
 
 #[tokio::test]
+async fn messages_that_wait_beyond_a_batch_are_all_sent() {
+    const MESSAGES: u64 = 200;
+    let mut scene = Scene::new(MEGABYTE).await;
+    scene.subscribe(&["/chatter"]).await;
+    for number in 1..=MESSAGES {
+        scene.deliver("/chatter", number, 100);
+    }
+    let mut numbers = Vec::new();
+    while numbers.last() != Some(&MESSAGES) {
+        if let Message::Binary(data) = scene.socket.next().await.unwrap().unwrap() {
+            numbers.push(u64::from_le_bytes(data[5..13].try_into().unwrap()));
+        }
+    }
+    assert_eq!(numbers, (1..=MESSAGES).collect::<Vec<_>>());
+}
+
+#[tokio::test]
 async fn interest_follows_the_subscriptions_and_ends_with_the_viewer() {
     let mut scene = Scene::new(MEGABYTE).await;
     scene.subscribe(&["/chatter"]).await;
