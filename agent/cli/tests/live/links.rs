@@ -469,7 +469,13 @@ impl<'a> Observed<'a> {
             .bytes()
             .fold(0_u32, |sum, byte| sum.wrapping_mul(31) + u32::from(byte));
         let mut talker = Talker::new(number, topic);
-        introduce(&talker, carrier)?;
+        // Participants announce themselves repeatedly: the agent may not observe a new interface
+        // yet.
+        wait_until("the agent has seen the announcement", || {
+            introduce(&talker, carrier)?;
+            let page = self.agent.scrape()?;
+            Ok(page.sum("ros2_topic_publishers", &[("topic", topic)]) > 0.0)
+        })?;
         let sizes: Vec<usize> = SIZES
             .iter()
             .copied()
