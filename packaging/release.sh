@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
 # Makes what a maintainer publishes, in target/publish. The files of `make dist` come first. The
-# others are wheels, sources of the packages for ROS, an archive of manifests and the Ansible role, an
-# image, a Helm chart, crates and a repository for apt. Notes, provenance, checksums and signatures describe them.
+# others are wheels, sources of the packages for ROS, and an archive of manifests and the Ansible role.
+# An image, a Helm chart, crates and a repository for apt follow. Notes, provenance, checksums and
+# signatures describe them.
 #
 #   packaging/release.sh             sign with the keys of the maintainers
 #   packaging/release.sh --trial     sign with keys that are deleted afterwards

@@ -412,8 +412,8 @@ zenoh_observed() {
     [ -z "$figure" ]
 }
 # Each path with type, mode, owner and target, and the checksum of each file in /etc. Left out are file
-# systems in memory, files of these checks, logs, caches of apt, locks and backups of dpkg, and what
-# systemd writes while it runs.
+# systems in memory, files of these checks, logs, and caches of apt. So are locks and backups of dpkg,
+# and what systemd writes while it runs.
 paths() {
     {
         find / -xdev \( -path /proc -o -path /sys -o -path /dev -o -path /run -o -path /tmp -o -path "$here" \

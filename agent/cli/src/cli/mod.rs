@@ -62,7 +62,6 @@ pub(crate) struct Arguments {
 }
 
 #[derive(Debug, Subcommand)]
-#[expect(clippy::large_enum_variant, reason = "there is one")]
 pub(crate) enum Command {
     /// Run the agent: observe this host or a capture, serve /metrics
     Run(Run),

@@ -482,7 +482,7 @@ fn forged_input_fills_no_table_beyond_its_cap() {
     ]);
     assert!(whole < 96 << 20, "{whole} bytes");
 
-    let whole = drive(12_000, 10_000_000, &mut robot::states);
+    let whole = drive(20_000, 10_000_000, &mut robot::states);
     assert_filled(&[
         "robot_managed_nodes",
         "robot_frames",

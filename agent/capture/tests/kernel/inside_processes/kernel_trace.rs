@@ -127,7 +127,12 @@ impl Division {
         let (mut state, mut since) = (Event::SwitchedIn, start);
         let within = events.iter().filter(|(at, _)| (start..end).contains(at));
         for &(at, event) in within {
-            division.add(state, at - since);
+            // A thread that was woken while it left its CPU waits for one: no later event wakes it.
+            let past = match (state, event) {
+                (Event::Blocked, Event::SwitchedIn) => Event::Woken,
+                _ => state,
+            };
+            division.add(past, at - since);
             since = at;
             state = match (state, event) {
                 // The thread was not blocked: it runs, or waits for a CPU already.
