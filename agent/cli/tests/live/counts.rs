@@ -99,7 +99,7 @@ fn rust_dds_point_clouds_of_2_72_mb_are_counted_as_recorded_on_the_wire() -> Res
 /// Streams without loss, with 10 and with 20 % loss.
 fn best_effort(stack: Stack) -> Result<()> {
     let _shared = MACHINE.read().unwrap_or_else(PoisonError::into_inner);
-    let streams = [0, 100, 200].map(|per_mille| lossy(Stream::small(SMALL_SAMPLES), per_mille));
+    let streams = [0, 100, 200].map(|per_mille| lossy(&Stream::small(SMALL_SAMPLES), per_mille));
     for seen in Exchange::each(stack, &streams)? {
         assert_eq!(seen.sent.sequences("pub").len() as u64, SMALL_SAMPLES);
         let received: BTreeSet<u64> = seen.received.sequences("sub").into_iter().collect();
@@ -131,7 +131,7 @@ fn reliable(stack: Stack) -> Result<()> {
         depth: 1000,
         ..Stream::small(SMALL_SAMPLES)
     };
-    let streams = [100, 200].map(|per_mille| lossy(stream.clone(), per_mille));
+    let streams = [100, 200].map(|per_mille| lossy(&stream, per_mille));
     for seen in Exchange::each(stack, &streams)? {
         assert_eq!(seen.sent.sequences("pub").len() as u64, SMALL_SAMPLES);
         let received: BTreeSet<u64> = seen.received.sequences("sub").into_iter().collect();
@@ -154,9 +154,13 @@ fn reliable(stack: Stack) -> Result<()> {
 }
 
 /// Returns a stream with this loss, on a topic of its own.
-fn lossy(stream: Stream, per_mille: u16) -> (Stream, u16) {
+fn lossy(stream: &Stream, per_mille: u16) -> (Stream, u16) {
     let topic = format!("{}_{per_mille}", stream.topic);
-    (Stream { topic, ..stream }, per_mille)
+    let stream = Stream {
+        topic,
+        ..stream.clone()
+    };
+    (stream, per_mille)
 }
 
 fn point_clouds(stack: Stack, size: usize) -> Result<()> {

@@ -81,9 +81,13 @@ fn a_pair_in_one_observed_process_counts_as_observed() {
 fn counted_inside(transport: Transport, observed: usize) -> TopicFacts {
     // A locator of iceoryx, or of a PSMX plugin such as `psmx_iox2`.
     let locator = [&16u32.to_le_bytes()[..], &7411u32.to_le_bytes(), &[0; 16]].concat();
-    let (announced, from): ((u16, &[u8]), fn(GuidPrefix) -> Message) = match transport {
-        Transport::Iceoryx => ((0x2f, &locator), Message::from),
-        _ => ((0x8006, &[0; 4]), Message::from_fast),
+    let announced: (u16, &[u8]) = match transport {
+        Transport::Iceoryx => (0x2f, &locator),
+        _ => (0x8006, &[0; 4]),
+    };
+    let from: fn(GuidPrefix) -> Message = match transport {
+        Transport::Iceoryx => Message::from,
+        _ => Message::from_fast,
     };
     let mut world = World::new();
     let (one, other) = (world.participant(1, 70), world.participant(2, 71));
