@@ -19,6 +19,8 @@ use ros2probe_testing::harness::wait_until;
 const CONFIG: &str = "/etc/ros2probe/ros2probe.yaml";
 const RUNS: &str = "systemctl is-active ros2probe.service";
 const EXIT: &str = "systemctl show --property ExecMainStatus --value ros2probe";
+/// All lines that were written before.
+const JOURNAL: &str = "journalctl --sync && journalctl --unit ros2probe --no-pager --output cat";
 const STARTS_AT_BOOT: &str = "systemctl is-enabled ros2probe.service";
 
 #[test]
@@ -144,7 +146,7 @@ fn only_the_drop_in_for_interfaces_permits_the_wire_source(
     ))?;
     host.text("systemctl restart ros2probe")?;
     prints(host, EXIT, "77")?;
-    let log = host.run("journalctl --unit ros2probe --no-pager --output cat")?;
+    let log = host.run(JOURNAL)?;
     let families = "RestrictAddressFamilies=AF_PACKET AF_NETLINK";
     ensure!(log.contains(families), "no {families} in {log}");
     let asks = log.contains("CapabilityBoundingSet=CAP_NET_RAW");
@@ -170,7 +172,7 @@ fn a_service_without_any_source_ends_with_the_missing_lines(host: &Debian) -> Re
     ))?;
     host.text("systemctl restart ros2probe")?;
     prints(host, EXIT, "77")?;
-    let log = host.run("journalctl --unit ros2probe --no-pager --output cat")?;
+    let log = host.run(JOURNAL)?;
     let line = match has_tcx()? {
         true => "RestrictAddressFamilies=",
         false => "CapabilityBoundingSet=CAP_NET_RAW",
