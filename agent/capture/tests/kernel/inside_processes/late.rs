@@ -161,8 +161,9 @@ fn a_call_beside_a_busy_thread_names_that_thread() {
         assert!(runnable >= call.duration / 5, "{call:#?}");
         let others = &call.activity.as_ref().unwrap().others;
         let named: Duration = others.iter().map(|other| other.duration).sum();
-        // A busy machine has further threads, of which the longest ones are named.
-        let is_whole = others.len() < MAX_NAMED_THREADS;
+        // A busy machine has further threads, of which the longest ones are named. The kernel may
+        // skip an event there.
+        let is_whole = others.len() < MAX_NAMED_THREADS && is_complete(call);
         assert!(!is_whole || named * 10 >= runnable * 9, "{call:#?}");
         let hog = others.iter().find(|other| other.process == hog.0.id());
         let hog = hog.unwrap_or_else(|| panic!("{call:#?}"));
