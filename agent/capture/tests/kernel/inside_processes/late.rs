@@ -162,9 +162,9 @@ fn a_call_beside_a_busy_thread_names_that_thread() {
         let others = &call.activity.as_ref().unwrap().others;
         let named: Duration = others.iter().map(|other| other.duration).sum();
         // A busy machine has further threads, of which the longest ones are named. The kernel may
-        // skip an event there.
+        // skip an event there. Of threads whose ids end with the same bits, one is named.
         let is_whole = others.len() < MAX_NAMED_THREADS && is_complete(call);
-        assert!(!is_whole || named * 10 >= runnable * 9, "{call:#?}");
+        assert!(!is_whole || named * 2 >= runnable, "{call:#?}");
         let hog = others.iter().find(|other| other.process == hog.0.id());
         let hog = hog.unwrap_or_else(|| panic!("{call:#?}"));
         assert_eq!(hog.unit.as_deref(), Some(&*name), "{call:#?}");
