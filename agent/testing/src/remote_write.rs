@@ -179,6 +179,23 @@ impl Receiver {
         self.state.lock().unwrap().answer = Box::new(answer);
     }
 
+    /// Stores each request that does not have a certain sample, and refuses the others. Like
+    /// Prometheus 2, it stores nothing of a request with the refused sample: the one in the middle of
+    /// `up` in the first request that has more than two.
+    pub fn refuse_one_sample(&self) {
+        let mut refused = None;
+        self.answer(move |write| {
+            let times = write.of("up");
+            if times.len() > 2 {
+                refused.get_or_insert(times[times.len() / 2].0);
+            }
+            match times.iter().any(|(at, _)| Some(*at) == refused) {
+                true => Reply::status(400),
+                false => Reply::stored(write),
+            }
+        });
+    }
+
     /// Returns what it stored, by request.
     #[must_use]
     pub fn stored(&self) -> Vec<Write> {

@@ -530,17 +530,7 @@ fn a_receiver_has_each_sample_once_and_in_order_after_all_faults_together() -> R
     collect_on_disk(&agent)?;
 
     // The receiver is back, but refuses one collection: "too old".
-    let mut refused = None;
-    receiver.answer(move |write| {
-        let times = write.of("up");
-        if times.len() > 2 {
-            refused.get_or_insert(times[times.len() / 2].0);
-        }
-        match times.iter().any(|(at, _)| Some(*at) == refused) {
-            true => Reply::status(400),
-            false => Reply::stored(write),
-        }
-    });
+    receiver.refuse_one_sample();
     let mut last = (0.0, 0);
     let same = wait_within(
         PATIENCE,

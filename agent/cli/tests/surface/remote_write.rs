@@ -264,18 +264,7 @@ fn a_sample_that_a_receiver_refuses_drops_no_other_sample() {
     let receiver = Receiver::start(|_| Reply::status(503));
     let mut agent = sending(&receiver, directory.path(), "");
     agent.wait_for_metric("ros2probe_remote_write_behind_seconds", |age| age > 4.0);
-    // Like Prometheus 2, it stores nothing of a request with a refused sample.
-    let mut refused = None;
-    receiver.answer(move |write| {
-        let times = write.of("up");
-        if times.len() > 2 {
-            refused.get_or_insert(times[times.len() / 2].0);
-        }
-        match times.iter().any(|(at, _)| Some(*at) == refused) {
-            true => Reply::status(400),
-            false => Reply::stored(write),
-        }
-    });
+    receiver.refuse_one_sample();
     let log = agent.wait_for_log("refuses samples");
     assert!(
         log.contains("400 Bad Request: as the test demands"),
