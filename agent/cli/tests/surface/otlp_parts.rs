@@ -136,6 +136,17 @@ async fn grpc_behind_a_proxy(limit: usize) -> (SocketAddr, Received) {
 
 /// Starts a receiver over HTTP that accepts bodies up to a size.
 async fn http(limit: usize) -> (SocketAddr, Received) {
+    serve_http(move |request, received| async move { http_answer(request, limit, &received).await })
+        .await
+}
+
+/// Starts a receiver over HTTP with these answers.
+async fn serve_http<F>(
+    answer: impl Fn(hyper::Request<Incoming>, Received) -> F + Clone + Send + 'static,
+) -> (SocketAddr, Received)
+where
+    F: Future<Output = hyper::Response<Full<Bytes>>> + Send + 'static,
+{
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
     let received = Received::default();
@@ -143,13 +154,13 @@ async fn http(limit: usize) -> (SocketAddr, Received) {
     tokio::spawn(async move {
         loop {
             let (stream, _) = listener.accept().await.unwrap();
-            let received = taken.clone();
-            let answer = service_fn(move |request: hyper::Request<Incoming>| {
-                let received = received.clone();
-                async move { Ok::<_, Infallible>(http_answer(request, limit, &received).await) }
+            let (answer, received) = (answer.clone(), taken.clone());
+            let service = service_fn(move |request: hyper::Request<Incoming>| {
+                let answered = answer(request, received.clone());
+                async move { Ok::<_, Infallible>(answered.await) }
             });
             let server = hyper::server::conn::http1::Builder::new();
-            tokio::spawn(server.serve_connection(TokioIo::new(stream), answer));
+            tokio::spawn(server.serve_connection(TokioIo::new(stream), service));
         }
     });
     (address, received)
@@ -373,36 +384,16 @@ async fn guarded_grpc() -> (SocketAddr, Received) {
 
 /// Starts a receiver over HTTP. It answers requests with another token with this status.
 async fn guarded_http(status: u16) -> (SocketAddr, Received) {
-    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
-    let address = listener.local_addr().unwrap();
-    let received = Received::default();
-    let taken = received.clone();
-    tokio::spawn(async move {
-        loop {
-            let (stream, _) = listener.accept().await.unwrap();
-            let received = taken.clone();
-            let answer = service_fn(move |request: hyper::Request<Incoming>| {
-                let received = received.clone();
-                async move {
-                    let token = request.headers().get("authorization");
-                    let is_known =
-                        token.is_some_and(|token| token.as_bytes() == ACCEPTED.as_bytes());
-                    let answer = match is_known {
-                        true => http_answer(request, usize::MAX, &received).await,
-                        false => {
-                            let mut refused = hyper::Response::default();
-                            *refused.status_mut() = hyper::StatusCode::from_u16(status).unwrap();
-                            refused
-                        }
-                    };
-                    Ok::<_, Infallible>(answer)
-                }
-            });
-            let server = hyper::server::conn::http1::Builder::new();
-            tokio::spawn(server.serve_connection(TokioIo::new(stream), answer));
+    serve_http(move |request, received| async move {
+        let token = request.headers().get("authorization");
+        if token.is_some_and(|token| token.as_bytes() == ACCEPTED.as_bytes()) {
+            return http_answer(request, usize::MAX, &received).await;
         }
-    });
-    (address, received)
+        let mut refused = hyper::Response::default();
+        *refused.status_mut() = hyper::StatusCode::from_u16(status).unwrap();
+        refused
+    })
+    .await
 }
 
 /// Earlier, the agent read the token only at its start, and a refusal of it cost the items.
