@@ -146,9 +146,8 @@ pub fn explanation(remedy: &str) -> String {
 
 #[cfg(test)]
 mod tests {
-    use ros2probe_model::facts::model_time::ModelTime;
-    use ros2probe_model::report::snapshot::ProcessFacts;
-    use ros2probe_wire::{DomainId, EntityId, Guid, RtpsDuration};
+    use ros2probe_testing::sample_robot;
+    use ros2probe_wire::{DomainId, EntityId, Guid};
 
     use super::*;
 
@@ -159,19 +158,7 @@ mod tests {
                 entity: EntityId([0, 0, 1, 0xc1]),
             },
             domain_id: DomainId(domain_id),
-            vendor: VendorId::default(),
-            product_version: None,
-            enclave: Some("/".into()),
-            process: ProcessFacts::default(),
-            first_seen: ModelTime::ZERO,
-            last_seen: ModelTime::ZERO,
-            lease: RtpsDuration::Infinite,
-            secured: false,
-            announces_by_tcp: false,
-            announces_unseen: false,
-            discovery_server: false,
-            restored: false,
-            addresses: Default::default(),
+            ..sample_robot::participant()
         }
     }
 

@@ -116,9 +116,36 @@ fn chains() -> ChainsFacts {
     }
 }
 
+/// Returns the participant of the robot's node.
+#[must_use]
+pub fn participant() -> ParticipantFacts {
+    ParticipantFacts {
+        guid: Guid::new(GuidPrefix([1; 12]), EntityId([0, 0, 1, 0xc1])),
+        domain_id: DomainId(0),
+        vendor: VendorId::EPROSIMA,
+        product_version: Some("3.2.5".into()),
+        enclave: Some("/".into()),
+        process: process(),
+        first_seen: ModelTime::from_nanoseconds(1),
+        last_seen: ModelTime::from_nanoseconds(2),
+        lease: ros2probe_wire::RtpsDuration::Finite(Duration::from_secs(20)),
+        secured: false,
+        announces_by_tcp: false,
+        announces_unseen: false,
+        discovery_server: false,
+        restored: false,
+        addresses: Addresses {
+            metatraffic: Box::default(),
+            default: Box::new([([10, 0, 0, 2], 7411).into()]),
+            tcp: Box::default(),
+        },
+    }
+}
+
 /// Returns an agent's full state for a robot with topics of these names, all watched by `/**`.
 pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
-    let guid = Guid::new(GuidPrefix([1; 12]), EntityId([0, 0, 1, 0xc1]));
+    let participant = participant();
+    let guid = participant.guid;
     let topics: Vec<TopicFacts> = names.into_iter().map(topic).collect();
     let watched = |topic: &TopicFacts| WatchedTopicFacts {
         domain_id: topic.domain_id,
@@ -129,27 +156,7 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
     Snapshot {
         at: ModelTime::from_nanoseconds(1_700_000_000_000_000_000),
         wall_clock: WallClock::default(),
-        participants: vec![ParticipantFacts {
-            guid,
-            domain_id: DomainId(0),
-            vendor: VendorId::EPROSIMA,
-            product_version: Some("3.2.5".into()),
-            enclave: Some("/".into()),
-            process: process(),
-            first_seen: ModelTime::from_nanoseconds(1),
-            last_seen: ModelTime::from_nanoseconds(2),
-            lease: ros2probe_wire::RtpsDuration::Finite(Duration::from_secs(20)),
-            secured: false,
-            announces_by_tcp: false,
-            announces_unseen: false,
-            discovery_server: false,
-            restored: false,
-            addresses: Addresses {
-                metatraffic: Box::default(),
-                default: Box::new([([10, 0, 0, 2], 7411).into()]),
-                tcp: Box::default(),
-            },
-        }],
+        participants: vec![participant],
         sockets: vec![SocketFacts {
             cookie: 77,
             process_id: Some(42),

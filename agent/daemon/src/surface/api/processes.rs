@@ -83,33 +83,18 @@ fn read(ids: BTreeMap<u32, Option<Arc<str>>>) -> ProcessList {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ros2probe_model::facts::model_time::ModelTime;
     use ros2probe_model::report::snapshot::{ParticipantFacts, ProcessFacts};
-    use ros2probe_wire::rtps::VendorId;
-    use ros2probe_wire::{DomainId, Guid, RtpsDuration};
+    use ros2probe_testing::sample_robot;
 
     fn participant(id: u32, cgroup: Option<&str>) -> ParticipantFacts {
         ParticipantFacts {
-            guid: Guid::default(),
-            domain_id: DomainId(0),
-            vendor: VendorId::default(),
-            product_version: None,
-            enclave: None,
             process: ProcessFacts {
                 host: None,
                 id: Some(id),
                 name: None,
                 cgroup: cgroup.map(Into::into),
             },
-            first_seen: ModelTime::ZERO,
-            last_seen: ModelTime::ZERO,
-            lease: RtpsDuration::Infinite,
-            secured: false,
-            announces_by_tcp: false,
-            announces_unseen: false,
-            discovery_server: false,
-            restored: false,
-            addresses: Default::default(),
+            ..sample_robot::participant()
         }
     }
 
